@@ -1,0 +1,1 @@
+"""Making demonstrations and reading datasets."""

@@ -1,0 +1,212 @@
+"""`lerobot-uca-collect`: demonstrations of a simulated task, as a LeRobot dataset.
+
+Example:
+    lerobot-uca-collect --env.type=metaworld_pointcloud --env.task=dial-turn --repo_id=local/dial-turn
+"""
+
+import multiprocessing
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from lerobot.configs import parser
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import SuppressProgressBars
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lerobot_uca.envs.configs import Expert, PointCloudEnvConfig
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+
+FIRST_SEED = 1_000_000
+"""Where the seeds of demonstrations start. LeRobot evaluates from seed 1000 upwards unless told otherwise."""
+
+MIN_SUCCESSFUL_STEPS = 5
+"""A demonstration is kept if so many of its steps are successful (the baselines' rule for Meta-World)."""
+
+MAX_ATTEMPTS = 20
+"""Attempts for each wanted episode before the collector gives up."""
+
+
+@dataclass
+class CollectConfig:
+    """What to collect and where to put it.
+
+    Args:
+        env: the environment and its task or tasks; with several, the dataset holds n_episodes of each.
+        repo_id: name of the dataset, 'user/name'.
+        root: folder to write; by default where LeRobot looks for it, $HF_LEROBOT_HOME/repo_id.
+        n_episodes: successful demonstrations of each task.
+        seed: seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of evaluation
+            (LeRobot's start at 1000), or the policy is tested on what it has seen.
+        overwrite: replace the folder if it exists.
+        push_to_hub: upload the dataset to the Hugging Face Hub under repo_id.
+        private: upload as a private dataset.
+    """
+
+    env: EnvConfig
+    repo_id: str
+    root: Path | None = None
+    n_episodes: int = 10
+    seed: int = FIRST_SEED
+    overwrite: bool = False
+    push_to_hub: bool = False
+    private: bool = False
+
+
+class Demonstration(NamedTuple):
+    """One episode: what was seen before each of L steps, what was done, and whether the step ended in success."""
+
+    point_cloud: NDArray[np.float32]  # (L, N, 3)
+    state: NDArray[np.float32]  # (L, S)
+    action: NDArray[np.float32]  # (L, A), as executed
+    success: NDArray[np.bool_]  # (L,)
+
+
+def demonstrate(env_factory: Callable[[], gym.Env], expert_factory: Callable[[], Expert], seed: int) -> Demonstration:
+    """Run the expert for a whole episode, also past its first success."""
+    env, expert = env_factory(), expert_factory()
+    observation, _ = env.reset(seed=seed)
+    steps: list[tuple[Any, ...]] = []
+    truncated = False
+    while not truncated:
+        action = expert(env)
+        before = observation
+        observation, _, _, truncated, info = env.step(action)
+        steps.append((before["point_cloud"], before["agent_pos"], action, info["is_success"]))
+    env.close()
+    return Demonstration(*(np.stack(column) for column in zip(*steps, strict=True)))
+
+
+def demonstrations(env_config: PointCloudEnvConfig, task: str, first_seed: int) -> Iterator[Demonstration]:
+    """Episodes of seeds first_seed, first_seed + 1, ... in this order, made by one process a core."""
+    make_env, make_expert = env_config.env_factory(task), env_config.expert_factory(task)
+    n_workers = os.cpu_count() or 1
+    with ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context("forkserver")) as pool:
+        seeds = count(first_seed)
+        pending = [pool.submit(demonstrate, make_env, make_expert, next(seeds)) for _ in range(n_workers + 1)]
+        try:
+            while True:
+                pending.append(pool.submit(demonstrate, make_env, make_expert, next(seeds)))
+                yield pending.pop(0).result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def collect(config: CollectConfig) -> LeRobotDataset:
+    """Collect, write and, if asked for, upload a dataset.
+
+    The dataset is written beside its folder and moved there when it is complete: a killed run leaves no folder.
+
+    Raises:
+        UserError: if the folder exists, cannot be written, or the expert fails too often.
+    """
+    env_config = config.env
+    if not isinstance(env_config, PointCloudEnvConfig):
+        raise UserError(f"Only point-cloud environments have a demonstrator, got env.type={env_config.type}.")
+    if config.n_episodes < 1:
+        raise UserError(f"n_episodes must be at least 1, got {config.n_episodes}.")
+    env_config.validate()
+    root = config.root or HF_LEROBOT_HOME / config.repo_id
+    if root.exists() and not config.overwrite:
+        raise UserError(f"'{root}' exists. Choose another --root, or replace it with --overwrite.")
+    unfinished = root.with_name(f".{root.name}.unfinished")
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+        _remove(unfinished)
+        _write(config, env_config, unfinished)
+        if root.exists():
+            replaced = root.with_name(f".{root.name}.replaced")
+            _remove(replaced)
+            root.rename(replaced)
+            unfinished.rename(root)
+            _remove(replaced)
+        else:
+            unfinished.rename(root)
+    except OSError as error:
+        raise UserError(f"Cannot write '{root}': {error}") from error
+    finally:
+        _remove(unfinished)
+    dataset = LeRobotDataset(config.repo_id, root=root)
+    if config.push_to_hub:
+        dataset.push_to_hub(private=config.private, tags=["uca_flow", "point-cloud", env_config.type])
+    return dataset
+
+
+def _remove(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write(config: CollectConfig, env_config: PointCloudEnvConfig, root: Path) -> None:
+    dataset = LeRobotDataset.create(
+        config.repo_id, fps=env_config.fps, features=_features(env_config), root=root, use_videos=False
+    )
+    try:
+        for task in (task for tasks in env_config.tasks().values() for task in tasks):
+            _collect_task(dataset, env_config, task, config.n_episodes, config.seed)
+    finally:
+        dataset.finalize()  # closes its files, which would otherwise come back when they are garbage-collected
+
+
+def _collect_task(
+    dataset: LeRobotDataset, env_config: PointCloudEnvConfig, task: str, n_episodes: int, first_seed: int
+) -> None:
+    description = env_config.task_description(task)
+    n_kept = 0
+    with tqdm(total=n_episodes, desc=f"Demonstrations of {task}", unit="episode") as progress:
+        for n_tried, episode in enumerate(demonstrations(env_config, task, first_seed), start=1):
+            if episode.success.sum() >= MIN_SUCCESSFUL_STEPS:
+                for point_cloud, state, action, _ in zip(*episode, strict=True):
+                    dataset.add_frame(
+                        {OBS_POINT_CLOUD: point_cloud, OBS_STATE: state, ACTION: action, "task": description}
+                    )
+                with SuppressProgressBars():
+                    dataset.save_episode()
+                n_kept += 1
+                progress.update()
+            progress.set_postfix(tried=n_tried)
+            if n_kept == n_episodes:
+                return
+            if n_tried >= MAX_ATTEMPTS * n_episodes:
+                raise UserError(
+                    f"The expert of '{task}' succeeded in {n_kept} of {n_tried} episodes, {n_episodes} are wanted."
+                )
+
+
+def _features(env_config: PointCloudEnvConfig) -> dict[str, dict[str, Any]]:
+    state_names, action_names = env_config.state_names(), env_config.action_names()
+    return {
+        OBS_POINT_CLOUD: {"dtype": "float32", "shape": (env_config.n_points, 3), "names": ["point", "xyz"]},
+        OBS_STATE: {"dtype": "float32", "shape": (len(state_names),), "names": state_names},
+        ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": action_names},
+    }
+
+
+@parser.wrap()
+def _main(config: CollectConfig) -> None:
+    dataset = collect(config)
+    print(
+        f"{dataset.num_episodes} episodes, {dataset.num_frames} frames, seeds from {config.seed}: {dataset.root}\n"
+        f"Evaluate on other seeds (lerobot-eval uses 1000 and up)."
+    )
+
+
+def main() -> None:
+    """The console command."""
+    register_third_party_plugins()
+    # LeRobot's parser wants a value for every option; a bare flag is what people type.
+    flags = {f"--{name}": f"--{name}=true" for name in ("overwrite", "push_to_hub", "private")}
+    sys.argv[1:] = [flags.get(argument, argument) for argument in sys.argv[1:]]
+    _main()

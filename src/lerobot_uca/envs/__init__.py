@@ -1,0 +1,1 @@
+"""Simulated tasks with point-cloud observations."""

@@ -1,0 +1,138 @@
+"""LeRobot's configurations of the environments: what `--env.type=...` finds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, override
+
+import gymnasium as gym
+import numpy as np
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+from lerobot.utils.constants import ACTION, OBS_STATE
+from numpy.typing import NDArray
+
+from lerobot_uca.envs import metaworld
+from lerobot_uca.envs.task_names import resolve_tasks
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+
+Expert = Callable[[Any], NDArray[np.float32]]
+"""From an environment to the action that a demonstrator would take in its present state."""
+
+
+@dataclass
+class PointCloudEnvConfig(EnvConfig):
+    """What all point-cloud environments share: features, task names and vector environments.
+
+    Args:
+        task: one task, several separated by commas, or groups of tasks.
+        n_points: points of each cloud.
+    """
+
+    n_points: int = 512
+
+    def __post_init__(self) -> None:
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(self.action_names()),)),
+            "point_cloud": PolicyFeature(FeatureType.STATE, (self.n_points, 3)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (len(self.state_names()),)),
+        }
+        self.features_map = {ACTION: ACTION, "point_cloud": OBS_POINT_CLOUD, "agent_pos": OBS_STATE}
+
+    def tasks(self) -> dict[str, tuple[str, ...]]:
+        """The tasks by suite: each entry of `task` is one."""
+        raise NotImplementedError
+
+    def env_factory(self, task: str) -> Callable[[], gym.Env]:
+        """Makes one environment of one task; light to send to another process."""
+        raise NotImplementedError
+
+    def expert_factory(self, task: str) -> Callable[[], Expert]:
+        """Makes the demonstrator of one task; light to send to another process."""
+        raise NotImplementedError
+
+    def task_description(self, task: str) -> str:
+        """What a task asks for, in English."""
+        raise NotImplementedError
+
+    def action_names(self) -> list[str]:
+        """What each number of an action means."""
+        raise NotImplementedError
+
+    def state_names(self) -> list[str]:
+        """What each number of `agent_pos` means."""
+        raise NotImplementedError
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Unused: these environments are not made by name."""
+        return {}
+
+    def validate(self) -> None:
+        """Raise a `UserError` for what cannot be made."""
+        if self.n_points < 1:
+            raise UserError(f"env.n_points must be at least 1, got {self.n_points}.")
+        self.tasks()
+
+    @override
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """No processing. Training asks for it before its first step: a wrong task must not be found hours later."""
+        self.validate()
+        return super().get_env_processors()
+
+    @override
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """{suite: {task_id: n_envs environments}}. Processes start, and simulators load, at the first reset."""
+        self.validate()
+        return {
+            suite: {
+                task_id: _vectorize(self.env_factory(task), n_envs, use_async_envs)
+                for task_id, task in enumerate(tasks)
+            }
+            for suite, tasks in self.tasks().items()
+        }
+
+
+def _vectorize(make: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -> gym.vector.VectorEnv:
+    # LeRobot waits for the slowest of a batch; an environment that has finished must not go on simulating.
+    if use_async_envs and n_envs > 1:
+        return _LazyAsyncVectorEnv([make] * n_envs)  # freezes by itself
+    return gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs)
+
+
+@EnvConfig.register_subclass("metaworld_pointcloud")
+@dataclass
+class MetaworldPointCloudConfig(PointCloudEnvConfig):
+    """Meta-World's v3 tasks, by name with or without '-v3', or easy, medium, hard, very_hard, paper, all."""
+
+    task: str | None = "drawer-close"
+    fps: int = metaworld.FPS
+
+    @override
+    def tasks(self) -> dict[str, tuple[str, ...]]:
+        names = ",".join(entry.strip().removesuffix("-v3") for entry in (self.task or "").split(","))
+        return resolve_tasks(
+            names, benchmark="Meta-World", tasks=metaworld.task_descriptions(), groups=metaworld.task_groups()
+        )
+
+    @override
+    def env_factory(self, task: str) -> Callable[[], gym.Env]:
+        return partial(metaworld.MetaworldPointCloudEnv, task, n_points=self.n_points)
+
+    @override
+    def expert_factory(self, task: str) -> Callable[[], Expert]:
+        return partial(metaworld.ScriptedExpert, task)
+
+    @override
+    def task_description(self, task: str) -> str:
+        return metaworld.task_descriptions()[task]
+
+    @override
+    def action_names(self) -> list[str]:
+        return ["x", "y", "z", "gripper"]
+
+    @override
+    def state_names(self) -> list[str]:
+        return [f"{part}_{axis}" for part in ("hand", "right_finger", "left_finger") for axis in "xyz"]

@@ -1,0 +1,215 @@
+"""Meta-World's 50 v3 tasks with point-cloud observations, seen by ray casting."""
+
+import json
+import warnings
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.envs.point_cloud import Camera, Crop, sample_farthest
+from lerobot_uca.envs.ray_casting import Marker, PictureCamera, PointCloudCamera
+from lerobot_uca.errors import UserError
+
+# Meta-World's camera 'corner2' (euler 3.9 2.3 0.6), moved to where DP3, FlowPolicy and MP1 put it. Its axes are
+# written out because the camera must exist before the simulator does; a test compares them with the model's.
+CORNER2_ROTATION = (
+    (-0.5499013297225573, 0.3762077406192429, 0.7457052121767203),
+    (-0.8331827568227445, -0.30954914217001317, -0.45824210011200406),
+    (0.058438183601257465, -0.8732966646449378, 0.4836712873610),
+)
+
+
+def corner2(width: int, height: int) -> Camera:
+    """The baselines' camera at a resolution [pixels]."""
+    return Camera("corner2", (0.6, 0.295, 0.8), CORNER2_ROTATION, fovy=60.0, width=width, height=height)
+
+
+CLOUD_CAMERA = corner2(128, 128)
+PICTURE_CAMERA = corner2(192, 192)
+PICTURE_ZOOM = 2  # each ray becomes 2 x 2 pixels: 384 x 384 is large enough to look at, and four times cheaper
+
+# The crop decides how well a policy learns, because every point on the table, the retaining wall around it or the
+# upper arm is one fewer on the task: it is as tight as the 50 tasks' objects and goals allow.
+CROP = Crop(low=(-0.5, 0.28, 0.005), high=(0.55, 0.97, 0.5))
+# Three tasks have a hole in a raised table (its top at 0.05 m). The hole is seen by the table around it.
+HOLE_CROP = Crop(low=(-0.25, 0.45, -0.1), high=(0.25, 0.97, 0.5))
+HOLE_TASKS = ("hand-insert", "pick-out-of-hole", "sweep-into")
+
+EPISODE_LENGTH = 200
+FPS = 80  # 5 simulation steps of 2.5 ms
+
+# FlowPolicy's list, which has the paper's counts: 21 easy, 4 medium, 4 hard, 5 very hard.
+PAPER_TASKS = (
+    *("button-press", "button-press-wall", "dial-turn", "door-close", "door-open", "door-unlock", "drawer-close"),
+    *("faucet-close", "faucet-open", "handle-press", "handle-pull", "lever-pull", "peg-unplug-side", "plate-slide"),
+    *("plate-slide-back", "plate-slide-back-side", "plate-slide-side", "reach", "reach-wall", "window-close"),
+    *("window-open", "coffee-pull", "hammer", "peg-insert-side", "soccer", "assembly", "hand-insert", "pick-place"),
+    *("push", "disassemble", "pick-place-wall", "shelf-place", "stick-pull", "stick-push"),
+)
+
+
+@cache
+def _lerobot_table() -> dict[str, dict[str, Any]]:
+    """LeRobot's own table of Meta-World's tasks; read as data, because LeRobot's module loads the simulator."""
+    return json.loads(files("lerobot").joinpath("envs", "metaworld_config.json").read_text(encoding="utf-8"))
+
+
+@cache
+def task_descriptions() -> dict[str, str]:
+    """What each of the 50 tasks asks for, in English, by name without '-v3'."""
+    return {name.removesuffix("-v3"): text for name, text in _lerobot_table()["TASK_DESCRIPTIONS"].items()}
+
+
+@cache
+def task_groups() -> dict[str, tuple[str, ...]]:
+    """Names that stand for several tasks: Meta-World's difficulties, the paper's 34 and all 50."""
+    difficulties = {
+        group: tuple(name.removesuffix("-v3") for name in names)
+        for group, names in _lerobot_table()["DIFFICULTY_TO_TASKS"].items()
+    }
+    return {**difficulties, "paper": PAPER_TASKS, "all": tuple(task_descriptions())}
+
+
+class MetaworldPointCloudEnv(gym.Env[Any, Any]):
+    """One Meta-World task, observed as the baselines observe it: a point cloud and the gripper's position.
+
+    Observation, world frame, metres:
+        point_cloud: (n_points, 3) float32, farthest point sampling of what `corner2` sees inside the crop, in
+            sampling order.
+        agent_pos: (9,) float32, positions of the hand, the right and the left finger.
+    Action: (4,) float32 in [-1, 1]: a motion of the hand by up to 1 cm along x, y and z, and the gripper's effort.
+    An episode terminates at the first success and is truncated after 200 steps. Stepping past a success is allowed
+    (the demonstrations do), as the simulation itself goes on. The simulator is created at the first reset, so
+    that vector environments build it in their workers.
+
+    Args:
+        task: a name from `task_descriptions()`.
+        n_points: points of the cloud.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium's own declaration)
+    render_mode = "rgb_array"
+    _max_episode_steps = EPISODE_LENGTH  # LeRobot reads it
+
+    def __init__(self, task: str, n_points: int = 512) -> None:
+        self.task = task
+        self.task_description = task_descriptions()[task]
+        self.n_points = n_points
+        self.observation_space = gym.spaces.Dict(
+            {
+                "point_cloud": gym.spaces.Box(-np.inf, np.inf, (n_points, 3), np.float32),
+                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (9,), np.float32),
+            }
+        )
+        self.action_space = gym.spaces.Box(-1, 1, (4,), np.float32)
+        self.expert_observation: Any = None
+        """Meta-World's own observation (39,) after the last reset or step, goal included: for scripted experts."""
+        self._simulator: Any = None
+        self.crop = HOLE_CROP if task in HOLE_TASKS else CROP
+        self._cloud_camera = PointCloudCamera(CLOUD_CAMERA, self.crop)
+        self._picture_camera: PictureCamera | None = None
+        self._n_steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+        """Start an episode: the seed alone decides which. Without a seed, one is drawn. There are no options."""
+        super().reset(seed=seed, options=options)
+        # A fresh simulator each time: some tasks keep state of the last episode, and the seed alone must decide.
+        self._simulator = _make_simulator(self.task)
+        self._simulator.seed(seed if seed is not None else int(self.np_random.integers(2**31)))
+        self.expert_observation, _ = self._simulator.reset()
+        # Meta-World moves bodies by editing the model and leaves the poses in the data behind.
+        mujoco.mj_forward(self._simulator.model, self._simulator.data)
+        self._n_steps = 0
+        return self._observe(), {"is_success": False}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[dict[str, NDArray[np.float32]], float, bool, bool, dict[str, Any]]:
+        """Execute an action for 12.5 ms of simulated time."""
+        if np.shape(action) != (4,) or not np.all(np.isfinite(action)):
+            raise UserError(f"Meta-World {self.task}: an action must be 4 finite numbers, got {action}.")
+        simulator = self._running_simulator()
+        self.expert_observation, reward, _, _, info = simulator.step(np.clip(action, -1, 1))
+        self._n_steps += 1
+        success = bool(info["success"])
+        return self._observe(), float(reward), success, self._n_steps >= EPISODE_LENGTH, {"is_success": success}
+
+    def render(self) -> NDArray[np.uint8]:
+        """The scene as a shaded ray-cast picture, (384, 384, 3) uint8."""
+        simulator = self._running_simulator()
+        self._picture_camera = self._picture_camera or PictureCamera(PICTURE_CAMERA)
+        picture = self._picture_camera.capture(simulator.model, simulator.data, self._markers())
+        # corner2 hangs upside down; people look at this picture, so turn it.
+        return picture[::-1, ::-1].repeat(PICTURE_ZOOM, axis=0).repeat(PICTURE_ZOOM, axis=1)
+
+    def close(self) -> None:
+        """Free the simulator; a later reset makes a new one."""
+        self._simulator = None
+
+    def _running_simulator(self) -> Any:
+        if self._simulator is None:
+            raise UserError(f"Meta-World {self.task}: call reset() first.")
+        return self._simulator
+
+    def _observe(self) -> dict[str, NDArray[np.float32]]:
+        simulator = self._simulator
+        points = self._cloud_camera.capture(simulator.model, simulator.data, self._markers())
+        if len(points) == 0:
+            raise UserError(
+                f"Meta-World {self.task}: the cloud is empty. Camera {CLOUD_CAMERA.name} at {CLOUD_CAMERA.position} "
+                f"sees no point inside the crop {self.crop.low} to {self.crop.high} m."
+            )
+        fingers = (simulator.data.site(name).xpos for name in ("rightEndEffector", "leftEndEffector"))
+        agent_pos = np.concatenate([simulator.get_endeff_pos(), *fingers])
+        return {
+            "point_cloud": sample_farthest(points, self.n_points),
+            "agent_pos": agent_pos.astype(np.float32),
+        }
+
+    def _markers(self) -> list[Marker]:
+        """Meta-World's goal sites. In push, pick-place or reach nothing else shows the goal.
+
+        The baselines' clouds hold them too, since MuJoCo's renderer draws sites.
+        """
+        model = self._simulator.model
+        return [
+            Marker(np.asarray(centre), model.site(name).size[0], model.site(name).rgba[:3])
+            for name, centre in self._simulator._target_site_config
+            if model.site(name).rgba[3] > 0
+        ]
+
+
+class ScriptedExpert:
+    """Meta-World's scripted demonstrator of a task, without noise. It sees the simulator's state, not the cloud."""
+
+    def __init__(self, task: str) -> None:
+        from metaworld.policies import ENV_POLICY_MAP  # slow to import, and not needed to read a configuration
+
+        experts: Any = ENV_POLICY_MAP
+        self._policy = experts[f"{task}-v3"]()
+
+    def __call__(self, env: MetaworldPointCloudEnv) -> NDArray[np.float32]:
+        """The action (4,) in [-1, 1], clipped as the environment would."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # 'constants may be too high': that is what the clip is for
+            action = self._policy.get_action(env.expert_observation)
+        return np.clip(action, -1, 1).astype(np.float32)
+
+
+def _make_simulator(task: str) -> Any:
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS  # slow to import, and not needed to read a configuration
+
+    simulator = ALL_V3_ENVIRONMENTS[f"{task}-v3"]()
+    simulator._set_task_called = True  # set_task() would freeze the objects; the seed decides instead
+    simulator._freeze_rand_vec = False
+    simulator.seeded_rand_vec = True
+    simulator._partially_observable = False  # the expert needs the goal; the policy sees only cloud and gripper
+    simulator.__dict__.pop("sawyer_observation_space", None)  # computed before, with the goal's bounds at zero
+    return simulator

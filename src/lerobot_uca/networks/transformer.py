@@ -1,0 +1,92 @@
+"""The Unified Condition-Action Transformer (paper sections 3.2 and 3.3).
+
+Letters: B samples, T horizon, A action dimensions, O observation steps, F observation features, D token width,
+S tokens of the sequence.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_uca.networks.embeddings import TimeEmbedding
+
+
+class SelfAttention(nn.Module):
+    """Multi-head self-attention.
+
+    The softmax is written out because PyTorch's fused `scaled_dot_product_attention` has no forward-mode derivative.
+    """
+
+    def __init__(self, dim: int, n_heads: int) -> None:
+        super().__init__()
+        self.n_heads = n_heads
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.out = nn.Linear(dim, dim)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, S, D) to (B, S, D)."""
+        q, k, v = self.qkv(tokens).unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)  # (B, heads, S, d)
+        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
+        return self.out((weights @ v).transpose(1, 2).flatten(-2))
+
+
+class Block(nn.Module):
+    """A pre-norm transformer block over the whole sequence."""
+
+    def __init__(self, dim: int, n_heads: int) -> None:
+        super().__init__()
+        self.attention = nn.Sequential(nn.LayerNorm(dim), SelfAttention(dim, n_heads))
+        self.feed_forward = nn.Sequential(
+            nn.LayerNorm(dim), nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim)
+        )
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(B, S, D) to (B, S, D)."""
+        tokens = tokens + self.attention(tokens)
+        return tokens + self.feed_forward(tokens)
+
+
+class UnifiedTransformer(nn.Module):
+    """u(z, t, h, o): conditions and actions are tokens of one sequence and refine each other.
+
+    The sequence is [c_1 .. c_O, tau_1 .. tau_Nt, eta_1 .. eta_Nh, y_1 .. y_T]: observations, timestep, interval,
+    actions. The output head reads the action tokens alone.
+    """
+
+    def __init__(
+        self,
+        *,
+        horizon: int,
+        n_actions: int,
+        n_obs_steps: int,
+        n_obs_features: int,
+        dim: int,
+        n_layers: int,
+        n_heads: int,
+        n_timestep_tokens: int,
+        n_interval_tokens: int,
+    ) -> None:
+        super().__init__()
+        self.horizon = horizon
+        self.embed_observation = nn.Linear(n_obs_features, dim)
+        self.embed_timestep = TimeEmbedding(dim)
+        self.embed_interval = TimeEmbedding(dim)
+        self.embed_action = nn.Linear(n_actions, dim)
+        self.observation_positions = nn.Parameter(0.02 * torch.randn(n_obs_steps, dim))
+        self.timestep_biases = nn.Parameter(0.02 * torch.randn(n_timestep_tokens, dim))
+        self.interval_biases = nn.Parameter(0.02 * torch.randn(n_interval_tokens, dim))
+        self.action_positions = nn.Parameter(0.02 * torch.randn(horizon, dim))
+        self.blocks = nn.Sequential(*(Block(dim, n_heads) for _ in range(n_layers)))
+        self.head = nn.Sequential(nn.LayerNorm(dim), nn.Linear(dim, n_actions))
+
+    def forward(self, z: Tensor, t: Tensor, h: Tensor, o: Tensor) -> Tensor:
+        """Z (B, T, A), t (B,), h (B,), o (B, O, F) to u (B, T, A)."""
+        tokens = torch.cat(
+            [
+                self.embed_observation(o) + self.observation_positions,
+                self.embed_timestep(t)[:, None] + self.timestep_biases,
+                self.embed_interval(h)[:, None] + self.interval_biases,
+                self.embed_action(z) + self.action_positions,
+            ],
+            dim=1,
+        )
+        return self.head(self.blocks(tokens)[:, -self.horizon :])

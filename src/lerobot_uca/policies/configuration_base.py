@@ -1,0 +1,158 @@
+"""What all point-cloud policies of this package have in common: observations, horizons, encoder, training recipe."""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+
+
+@dataclass
+class PointCloudPolicyConfig(PreTrainedConfig):
+    """Configuration shared by the policies that see a point cloud and a robot state.
+
+    Which steps are observed, predicted and executed, for the default values (0 is the current step):
+
+        | step        | -1  |  0  |  1  |  2  |
+        | observed    | yes | yes |     |     |   n_obs_steps = 2
+        | predicted   | yes | yes | yes | yes |   horizon = 4
+        | executed    |     | yes | yes | yes |   n_action_steps = 3, entries [1:4] of the prediction
+
+    Args:
+        n_obs_steps: observation steps O, the current one included.
+        horizon: predicted actions T, from the first observation step on.
+        n_action_steps: actions executed before the next prediction, from the current step on.
+        n_points: how many points of a cloud the policy looks at, the first ones; None for all. Clouds of this
+            package's environments are in farthest-point order, so the first ones are spread evenly.
+        point_widths, n_point_features, n_state_features: sizes of the observation encoder (those of the baselines).
+        dtype: precision of training: 'float32' or 'bfloat16' (autocast; the weights stay float32).
+        ema_power, ema_max_decay: the averaged weights follow with decay 1 - (1 + step)^-ema_power, at most
+            ema_max_decay.
+        optimizer_*, scheduler_*: AdamW and its warm-up, followed by a cosine to zero over the remaining steps. A norm
+            of 0 switches gradient clipping off.
+    """
+
+    n_obs_steps: int = 2
+    horizon: int = 4
+    n_action_steps: int = 3
+    n_points: int | None = None
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "STATE": NormalizationMode.MIN_MAX,  # of the point cloud too: LeRobot takes it for a state
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+
+    point_widths: tuple[int, ...] = (64, 128, 256)
+    n_point_features: int = 64
+    n_state_features: int = 64
+
+    dtype: str = "float32"
+    ema_power: float = 0.75
+    ema_max_decay: float = 0.9999
+    optimizer_lr: float = 1e-4
+    optimizer_betas: tuple[float, float] = (0.95, 0.999)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 1e-6
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_steps: int = 500
+
+    def validate_sizes(self) -> None:
+        """Raise a `UserError` for values that do not fit together."""
+        for name in ("n_obs_steps", "horizon", "n_action_steps"):
+            if getattr(self, name) < 1:
+                raise UserError(f"policy.{name} must be at least 1, got {getattr(self, name)}.")
+        if self.horizon < self.n_obs_steps + self.n_action_steps - 1:
+            raise UserError(
+                f"policy.horizon must be at least n_obs_steps + n_action_steps - 1 = "
+                f"{self.n_obs_steps + self.n_action_steps - 1}, got {self.horizon}: the actions to execute would not "
+                "all be predicted."
+            )
+        if self.n_points is not None and self.n_points < 1:
+            raise UserError(f"policy.n_points must be at least 1 or null (all points), got {self.n_points}.")
+        if self.dtype not in ("float32", "bfloat16"):
+            raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
+
+    def validate_features(self) -> None:
+        """Keep of the dataset's features what the policy uses: a cloud, a state and an action.
+
+        Raises:
+            UserError: if one is missing or has a shape that does not fit, or if `validate_sizes` finds something.
+        """
+        self.validate_sizes()
+        inputs: dict[str, PolicyFeature] = self.input_features or {}
+        for key, shape in ((OBS_POINT_CLOUD, "(N, 3)"), (OBS_STATE, "(S,)")):
+            if key not in inputs:
+                raise UserError(
+                    f"Policy '{self.type}' needs the feature '{key}' of shape {shape}, "
+                    f"got {', '.join(inputs) or 'none'}."
+                )
+        if ACTION not in (self.output_features or {}):
+            raise UserError(f"Policy '{self.type}' needs the feature '{ACTION}' of shape (A,).")
+        cloud, state, action = inputs[OBS_POINT_CLOUD], inputs[OBS_STATE], self.output_features[ACTION]
+        if len(cloud.shape) != 2 or cloud.shape[1] != 3 or cloud.shape[0] < (self.n_points or 1):
+            raise UserError(
+                f"'{OBS_POINT_CLOUD}' must have shape (N, 3) with N at least {self.n_points or 1} (policy.n_points), "
+                f"got {tuple(cloud.shape)}."
+            )
+        for key, feature in ((OBS_STATE, state), (ACTION, action)):
+            if len(feature.shape) != 1:
+                raise UserError(f"'{key}' must be a vector, got shape {tuple(feature.shape)}.")
+        self.input_features: dict[str, PolicyFeature] | None = {
+            OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, tuple(cloud.shape)),
+            OBS_STATE: PolicyFeature(FeatureType.STATE, tuple(state.shape)),
+        }
+
+    @property
+    def n_states(self) -> int:
+        """S, dimensions of the robot state."""
+        assert self.input_features is not None
+        return self.input_features[OBS_STATE].shape[0]
+
+    @property
+    def n_actions(self) -> int:
+        """A, dimensions of an action."""
+        return self.output_features[ACTION].shape[0]
+
+    @property
+    def n_obs_features(self) -> int:
+        """F, features of one observation step."""
+        return self.n_point_features + self.n_state_features
+
+    @property
+    def executed(self) -> slice:
+        """Which entries of a prediction are executed."""
+        return slice(self.n_obs_steps - 1, self.n_obs_steps - 1 + self.n_action_steps)
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """Observed steps, relative to the current one."""
+        return list(range(1 - self.n_obs_steps, 1))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """Predicted steps, relative to the current one."""
+        return list(range(1 - self.n_obs_steps, 1 - self.n_obs_steps + self.horizon))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Rewards are not used."""
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """AdamW with the values above."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            eps=self.optimizer_eps,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
+        """Warm-up, then cosine to zero at the last step."""
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)

@@ -1,0 +1,242 @@
+"""The base of the point-cloud policies: observation history, action queue, averaged weights.
+
+A method adds its own network, loss and sampler.
+
+Letters: B samples, O observation steps, N points, S state dimensions, T horizon, A action dimensions, F features.
+"""
+
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Iterable, Mapping
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.policies.utils import populate_queues
+from lerobot.utils.constants import ACTION, OBS_STATE
+from safetensors import SafetensorError
+from torch import Tensor, nn
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.networks.observation_encoder import ObservationEncoder
+from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+
+OBSERVATION_KEYS = (OBS_POINT_CLOUD, OBS_STATE)
+
+
+class Model(nn.Module):
+    """What is trained: an encoder of observations and a network that makes actions from its features."""
+
+    def __init__(self, encoder: nn.Module, generator: nn.Module) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.generator = generator
+
+
+class MethodLoss(NamedTuple):
+    """A method's loss for each sample, (B,), and its parts to log, each (B,)."""
+
+    total: Tensor
+    parts: dict[str, Tensor]
+
+
+class PointCloudPolicy(PreTrainedPolicy):
+    """A LeRobot policy that makes chunks of actions from point clouds and robot states.
+
+    A subclass says which network makes the actions (`make_generator`), how it is trained (`compute_loss`) and how
+    it is sampled (`generate`).
+
+    In training mode the trained weights are used, in eval mode their exponential moving average. Both are saved, so
+    that a checkpoint can be resumed and is, when loaded, what was evaluated.
+    """
+
+    config_class = PointCloudPolicyConfig
+    name = "point_cloud_base"
+    config: PointCloudPolicyConfig
+    ema_step: Tensor
+
+    def __init__(self, config: PointCloudPolicyConfig, **_: Any) -> None:
+        # `make_policy` passes the dataset's statistics and metadata as well; normalisation is the processors' task.
+        if not isinstance(config, self.config_class):
+            raise UserError(
+                f"{type(self).__name__} needs a configuration or checkpoint of policy type '{self.name}', got one of "
+                f"type '{getattr(config, 'type', type(config).__name__)}'."
+            )
+        super().__init__(config)
+        config.validate_features()
+        encoder = ObservationEncoder(
+            config.n_states, config.point_widths, config.n_point_features, config.n_state_features
+        )
+        self.model = Model(encoder, self.make_generator())
+        self.ema_model = deepcopy(self.model).requires_grad_(False)
+        self.register_buffer("ema_step", torch.zeros((), dtype=torch.long))
+        self.reset()
+
+    @abstractmethod
+    def make_generator(self) -> nn.Module:
+        """The network that makes actions from observation features (B, O, F)."""
+
+    @abstractmethod
+    def compute_loss(self, generator: nn.Module, x: Tensor, o: Tensor, mask: Tensor) -> MethodLoss:
+        """The loss for expert actions x (B, T, A), features o (B, O, F) and mask (B, T), True for steps that count."""
+
+    @abstractmethod
+    def generate(self, generator: nn.Module, noise: Tensor, o: Tensor) -> Tensor:
+        """Actions (B, T, A) from noise (B, T, A) and features o (B, O, F)."""
+
+    # Training ---------------------------------------------------------------------------------------------------
+
+    def get_optim_params(self) -> Iterable[nn.Parameter]:
+        """The trained parameters; the averaged ones follow by `update`."""
+        return self.model.parameters()
+
+    def forward(self, batch: Mapping[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """The loss of a batch of windows, as a mean or, with reduction='none', for each sample (B,).
+
+        Args:
+            batch: normalised; point cloud (B, O, N, 3), state (B, O, S), action (B, T, A) and, if there is
+                padding, action_is_pad (B, T). Padded steps do not count.
+
+        Raises:
+            UserError: for wrong shapes, and for NaN or infinite values.
+        """
+        if reduction not in ("mean", "none"):
+            raise UserError(f"reduction must be 'mean' or 'none', got '{reduction}'.")
+        self._check_shapes(batch)
+        x = batch[ACTION]
+        expected = (self.config.horizon, self.config.n_actions)
+        if x.shape[1:] != expected:
+            raise UserError(f"'{ACTION}' must have shape (B, {expected[0]}, {expected[1]}), got {tuple(x.shape)}.")
+        padded = batch.get(f"{ACTION}_is_pad")
+        mask = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device) if padded is None else ~padded
+        model = self.active_model
+        loss = self.compute_loss(model.generator, x, self._encode(model, batch), mask)
+        parts = {name: value.mean().item() for name, value in loss.parts.items()}
+        mean = loss.total.mean()
+        if not torch.isfinite(mean):
+            self._explain_non_finite(batch, (*OBSERVATION_KEYS, ACTION))
+        return (mean if reduction == "mean" else loss.total), parts
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Let the averaged weights follow; LeRobot calls it after each optimiser step."""
+        self.ema_step += 1
+        decay = min(1 - (1 + self.ema_step.item()) ** -self.config.ema_power, self.config.ema_max_decay)
+        torch._foreach_lerp_(list(self.ema_model.parameters()), list(self.model.parameters()), 1 - decay)
+
+    # Inference --------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Forget observations and planned actions: an episode begins."""
+        self._history: dict[str, deque[Tensor]] = {
+            key: deque(maxlen=self.config.n_obs_steps) for key in OBSERVATION_KEYS
+        }
+        self._planned: deque[Tensor] = deque()
+
+    @torch.no_grad()
+    def select_action(self, batch: Mapping[str, Tensor], noise: Tensor | None = None) -> Tensor:
+        """The next action (B, A), normalised. Every n_action_steps calls the policy plans anew.
+
+        Args:
+            batch: the newest observation, normalised; point cloud (B, N, 3), state (B, S). Each call's is remembered,
+                and the first one stands for those before it.
+            noise: (B, T, A), drawn if not given.
+        """
+        self._remember(batch)
+        if not self._planned:
+            self._planned.extend(self._plan(self._remembered(), noise).unbind(dim=1))
+        return self._planned.popleft()
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: Mapping[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
+        """The actions to execute from now on, (B, n_action_steps, A), normalised.
+
+        Args:
+            batch: normalised; either the newest observation, (B, N, 3) and (B, S), which is remembered for the
+                next call, or a whole history, (B, O, N, 3) and (B, O, S), which is not.
+            noise: (B, T, A), drawn if not given.
+        """
+        if _get(batch, OBS_POINT_CLOUD).ndim == 4:
+            return self._plan(batch, noise)
+        self._remember(batch)
+        return self._plan(self._remembered(), noise)
+
+    @property
+    def active_model(self) -> Model:
+        """The trained model in training mode, its moving average in eval mode."""
+        return self.model if self.training else self.ema_model
+
+    def _remember(self, batch: Mapping[str, Tensor]) -> None:
+        populate_queues(self._history, {key: _get(batch, key) for key in OBSERVATION_KEYS})
+
+    def _remembered(self) -> dict[str, Tensor]:
+        return {key: torch.stack(list(frames), dim=1) for key, frames in self._history.items()}
+
+    def _plan(self, history: Mapping[str, Tensor], noise: Tensor | None) -> Tensor:
+        self._check_shapes(history)
+        state = history[OBS_STATE]
+        if noise is None:
+            noise = torch.randn(len(state), self.config.horizon, self.config.n_actions, device=state.device)
+        model = self.active_model
+        actions = self.generate(model.generator, noise, self._encode(model, history))[:, self.config.executed]
+        # NaN and infinite points end up in the actions, which are far fewer to check; a robot must never get them.
+        if not torch.isfinite(actions).all():
+            self._explain_non_finite(history, OBSERVATION_KEYS)
+        return actions
+
+    def _encode(self, model: Model, batch: Mapping[str, Tensor]) -> Tensor:
+        cloud = batch[OBS_POINT_CLOUD][..., : self.config.n_points, :]
+        return model.encoder(cloud, batch[OBS_STATE])
+
+    # Bad input --------------------------------------------------------------------------------------------------
+
+    def _check_shapes(self, batch: Mapping[str, Tensor]) -> None:
+        cloud, state = _get(batch, OBS_POINT_CLOUD), _get(batch, OBS_STATE)
+        n_obs, n_points = self.config.n_obs_steps, self.config.n_points or 1
+        if cloud.ndim != 4 or cloud.shape[1] != n_obs or cloud.shape[2] < n_points or cloud.shape[3] != 3:
+            raise UserError(
+                f"'{OBS_POINT_CLOUD}' must have shape (B, {n_obs}, N, 3) with N at least {n_points}, "
+                f"got {tuple(cloud.shape)}."
+            )
+        expected = (len(cloud), n_obs, self.config.n_states)
+        if tuple(state.shape) != expected:
+            raise UserError(f"'{OBS_STATE}' must have shape {expected}, got {tuple(state.shape)}.")
+
+    def _explain_non_finite(self, batch: Mapping[str, Tensor], keys: Iterable[str]) -> None:
+        for key in keys:
+            n_bad = int((~torch.isfinite(batch[key])).sum())
+            if n_bad:
+                raise UserError(f"'{key}' must be finite, got {n_bad} of {batch[key].numel()} values NaN or infinite.")
+        raise FloatingPointError(
+            f"Policy '{self.name}' made NaN or infinite values from finite observations: the training diverged."
+        )
+
+    # Checkpoints ------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def _load_as_safetensor(
+        cls,
+        model: Self,
+        model_file: str,
+        map_location: str,
+        strict: bool,  # noqa: ARG003 (LeRobot passes False)
+    ) -> Self:
+        """Load weights, all of them: LeRobot would only warn of missing ones and evaluate a half-random policy."""
+        if not Path(model_file).is_file():
+            raise UserError(f"The checkpoint has no weights: '{model_file}' does not exist.")
+        try:
+            return super()._load_as_safetensor(model, model_file, map_location, strict=True)
+        except (SafetensorError, RuntimeError) as error:
+            reason = " ".join(str(error).split())
+            raise UserError(
+                f"'{model_file}' does not hold the weights of this '{cls.name}' policy: {reason}"
+            ) from error
+
+
+def _get(batch: Mapping[str, Tensor], key: str) -> Tensor:
+    if key not in batch:
+        raise UserError(f"The batch must hold '{key}', got {', '.join(batch) or 'nothing'}.")
+    return batch[key]

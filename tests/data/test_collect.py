@@ -1,0 +1,121 @@
+import gc
+import re
+import shutil
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs import make_env_config
+
+from lerobot_uca.data import collect as collecting
+from lerobot_uca.data.collect import CollectConfig, collect, demonstrate
+from lerobot_uca.envs.configs import MetaworldPointCloudConfig
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+
+
+def config(root, **changes):
+    env = MetaworldPointCloudConfig(task="drawer-close", n_points=16)
+    return CollectConfig(**{"env": env, "repo_id": "test/drawer", "root": root, "n_episodes": 1, **changes})
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory):
+    root = tmp_path_factory.mktemp("collected") / "drawer"
+    return collect(config(root))
+
+
+def test_a_dataset_holds_whole_episodes_as_executed(collected):
+    assert (collected.num_episodes, collected.num_frames, collected.fps) == (1, 200, 80)
+    assert set(collected.features) >= {OBS_POINT_CLOUD, "observation.state", "action"}
+    env = collected_env()
+    episode = demonstrate(env.env_factory("drawer-close"), env.expert_factory("drawer-close"), collecting.FIRST_SEED)
+    frames = [collected[index] for index in range(200)]
+    np.testing.assert_array_equal(np.stack([frame[OBS_POINT_CLOUD] for frame in frames]), episode.point_cloud)
+    np.testing.assert_array_equal(np.stack([frame["observation.state"] for frame in frames]), episode.state)
+    np.testing.assert_array_equal(np.stack([frame["action"] for frame in frames]), episode.action)
+    assert np.abs(episode.action).max() == 1  # the expert asks for more; what is written is what was done
+    assert episode.success.sum() >= collecting.MIN_SUCCESSFUL_STEPS
+    assert frames[0]["task"] == env.task_description("drawer-close")
+
+
+def collected_env():
+    return MetaworldPointCloudConfig(task="drawer-close", n_points=16)
+
+
+def test_statistics_are_per_channel(collected):
+    for statistic in ("min", "max"):
+        assert collected.meta.stats[OBS_POINT_CLOUD][statistic].shape == (3,)
+
+
+def test_nothing_but_the_dataset_is_left(collected):
+    assert [path.name for path in collected.root.parent.iterdir()] == ["drawer"]
+
+
+def test_an_existing_folder_is_kept_unless_overwritten(collected, tmp_path):
+    root = tmp_path / "drawer"
+    shutil.copytree(collected.root, root)
+    with pytest.raises(UserError, match=re.escape(f"'{root}' exists. Choose another --root, or replace it")):
+        collect(config(root))
+    assert collect(config(root, overwrite=True)).num_frames == 200
+
+
+@pytest.fixture
+def killed_while_writing(monkeypatch):
+    """The second episode is interrupted."""
+    save_episode = LeRobotDataset.save_episode
+
+    def save_or_die(self):
+        if self.num_episodes:
+            raise KeyboardInterrupt
+        save_episode(self)
+
+    monkeypatch.setattr(LeRobotDataset, "save_episode", save_or_die)
+
+
+@pytest.mark.usefixtures("killed_while_writing")
+def test_a_run_that_dies_leaves_nothing(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        collect(config(tmp_path / "drawer", n_episodes=2))
+    gc.collect()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_run_could_not_remove_is_hidden_and_replaced(tmp_path):
+    (tmp_path / ".drawer.unfinished" / "meta").mkdir(parents=True)
+    collect(config(tmp_path / "drawer"))
+    assert [path.name for path in tmp_path.iterdir()] == ["drawer"]
+
+
+@pytest.mark.usefixtures("killed_while_writing")
+def test_an_overwrite_that_dies_keeps_the_old_dataset(collected, tmp_path):
+    root = tmp_path / "drawer"
+    shutil.copytree(collected.root, root)
+    with pytest.raises(KeyboardInterrupt):
+        collect(config(root, n_episodes=2, overwrite=True))
+    assert LeRobotDataset("test/drawer", root=root).num_frames == 200
+
+
+def test_an_expert_that_fails_is_reported(tmp_path, monkeypatch):
+    failed = collecting.Demonstration(*(np.zeros((3, 1)) for _ in range(3)), success=np.zeros(3, dtype=bool))
+    monkeypatch.setattr(collecting, "demonstrations", lambda *_: iter([failed] * 1000))
+    with pytest.raises(UserError, match="The expert of 'drawer-close' succeeded in 0 of 20 episodes, 1 are wanted"):
+        collect(config(tmp_path / "drawer"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(UserError, match="Cannot write"):
+        collect(config(tmp_path / "file" / "drawer"))
+
+
+def test_seeds_of_demonstrations_and_evaluation_are_apart():
+    assert collecting.FIRST_SEED > 1000 + 100_000
+
+
+def test_wrong_settings(tmp_path):
+    with pytest.raises(UserError, match="n_episodes must be at least 1, got 0"):
+        collect(config(tmp_path / "new", n_episodes=0))
+    with pytest.raises(UserError, match=r"Only point-cloud environments have a demonstrator, got env\.type=pusht"):
+        collect(config(tmp_path / "new", env=make_env_config("pusht")))

@@ -1,0 +1,212 @@
+import os
+
+import mujoco
+import numpy as np
+import pytest
+from lerobot.envs import make_env, make_env_config, preprocess_observation
+from lerobot.envs.utils import env_to_policy_features
+
+from lerobot_uca.envs import metaworld
+from lerobot_uca.envs.metaworld import (
+    CLOUD_CAMERA,
+    MetaworldPointCloudEnv,
+    ScriptedExpert,
+    task_descriptions,
+    task_groups,
+)
+from lerobot_uca.envs.point_cloud import Crop
+from lerobot_uca.errors import UserError
+
+# Which bodies are part of the furniture is known to the simulator; the crop itself goes by position only.
+FURNITURE = ("base", "tablelink", "RetainingWall", "right_", "controller_box", "pedestal", "torso", "head", "screen")
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = MetaworldPointCloudEnv("drawer-close", n_points=64)
+    env.reset(seed=0)
+    return env
+
+
+def rollout(env: MetaworldPointCloudEnv, seed: int, n_steps: int = 3) -> list[np.ndarray]:
+    observation, _ = env.reset(seed=seed)
+    arrays = [observation["point_cloud"], observation["agent_pos"]]
+    rng = np.random.default_rng(0)
+    for _ in range(n_steps):
+        observation, reward, *_ = env.step(rng.uniform(-1, 1, 4).astype(np.float32))
+        arrays += [observation["point_cloud"], observation["agent_pos"], np.array(reward)]
+    return arrays
+
+
+def test_observations_are_what_the_spaces_say(env):
+    observation, info = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert info == {"is_success": False}
+    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation)
+    assert isinstance(reward, float)
+    assert (terminated, truncated, info["is_success"]) == (False, False, False)
+
+
+def test_the_camera_is_metaworlds_corner2_moved(env):
+    simulator = metaworld._make_simulator("drawer-close")
+    camera = simulator.model.camera("corner2").id
+    simulator.model.cam_pos[camera] = CLOUD_CAMERA.position
+    mujoco.mj_forward(simulator.model, simulator.data)
+    np.testing.assert_allclose(simulator.data.cam_xmat[camera].reshape(3, 3), CLOUD_CAMERA.rotation, atol=1e-12)
+    np.testing.assert_allclose(simulator.data.cam_xpos[camera], CLOUD_CAMERA.position)
+    assert simulator.model.cam_fovy[camera] == CLOUD_CAMERA.fovy
+    assert simulator.dt == pytest.approx(1 / metaworld.FPS)
+
+
+def test_the_cloud_lies_inside_the_crop(env):
+    observation, _ = env.reset(seed=0)
+    cloud = observation["point_cloud"].astype(np.float64)
+    slack = 1e-6  # float32
+    low, high = np.array(env.crop.low) - slack, np.array(env.crop.high) + slack
+    assert Crop(tuple(low), tuple(high)).contains(cloud).all()
+    assert len(np.unique(cloud, axis=0)) == 64
+
+
+def test_agent_pos_is_hand_and_fingers(env):
+    observation, _ = env.reset(seed=0)
+    data = env._simulator.data
+    expected = [data.body("hand").xpos, data.site("rightEndEffector").xpos, data.site("leftEndEffector").xpos]
+    np.testing.assert_allclose(observation["agent_pos"], np.concatenate(expected), atol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["drawer-close", "assembly", "pick-place", "door-lock"])
+def test_a_seed_gives_the_same_episode_in_any_order_and_another_seed_does_not(task):
+    env = MetaworldPointCloudEnv(task, n_points=64)
+    first = rollout(env, 7)
+    other = rollout(env, 8)
+    again = rollout(MetaworldPointCloudEnv(task, n_points=64), 7)
+    after_another = rollout(env, 7)
+    for a, b, c in zip(first, again, after_another, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+    assert not np.array_equal(first[0], other[0])
+
+
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_vector_environments_give_the_episodes_of_single_ones(use_async_envs):
+    config = make_env_config("metaworld_pointcloud", task="dial-turn-v3", n_points=64)
+    vector = make_env(config, n_envs=2, use_async_envs=use_async_envs)["dial-turn"][0]
+    try:
+        observations, _ = vector.reset(seed=[5, 6])
+        assert vector.call("_max_episode_steps")[0] == 200
+        assert vector.call("task")[0] == "dial-turn"
+        assert vector.call("task_description")[0] == task_descriptions()["dial-turn"]
+        actions = np.full((2, 4), 0.5, dtype=np.float32)
+        stepped, *_, info = vector.step(actions)
+        assert info["is_success"].tolist() == [False, False]
+        assert vector.call("render")[0].shape == (384, 384, 3)
+    finally:
+        vector.close()
+    for index, seed in enumerate((5, 6)):
+        single = MetaworldPointCloudEnv("dial-turn", n_points=64)
+        observation, _ = single.reset(seed=seed)
+        np.testing.assert_array_equal(observations["point_cloud"][index], observation["point_cloud"])
+        np.testing.assert_array_equal(stepped["point_cloud"][index], single.step(actions[index])[0]["point_cloud"])
+
+
+def test_observations_reach_the_policy_under_the_features_names(env):
+    config = make_env_config("metaworld_pointcloud", task="drawer-close", n_points=64)
+    observation, _ = env.reset(seed=0)
+    batch = preprocess_observation(observation)
+    for key, feature in env_to_policy_features(config).items():
+        if key != "action":
+            assert tuple(batch[key].shape[-len(feature.shape) :]) == feature.shape
+
+
+def test_the_expert_succeeds_and_the_episode_can_go_on():
+    env, expert = MetaworldPointCloudEnv("drawer-close", n_points=16), ScriptedExpert("drawer-close")
+    env.reset(seed=0)
+    successes = []
+    for step in range(200):
+        _, _, terminated, truncated, info = env.step(expert(env))
+        assert terminated == info["is_success"]
+        assert truncated == (step == 199)
+        successes.append(terminated)
+    assert sum(successes) > 100
+
+
+def test_rendering_needs_no_opengl(env, monkeypatch):
+    for name in ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM"):
+        monkeypatch.delenv(name, raising=False)
+    picture = env.render()
+    assert picture.shape == (384, 384, 3)
+    assert picture.std() > 10
+    assert "OpenGL" not in {name.split(".")[0] for name in os.sys.modules}
+
+
+@pytest.mark.parametrize("task", sorted(task_descriptions()))
+def test_objects_and_goals_lie_inside_the_crop(task):
+    """Two seeds a task; benchmarks/crop.py checks fifty."""
+    env = MetaworldPointCloudEnv(task, n_points=16)
+    low, high = np.array(env.crop.low), np.array(env.crop.high)
+    low[2] -= 0.03  # an object's origin may lie in or under the table it stands on
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        simulator = env._simulator
+        positions = np.array(simulator._get_pos_objects()).reshape(-1, 3)
+        positions = np.concatenate([positions, [simulator._target_pos]])
+        assert Crop(tuple(low), tuple(high)).contains(positions).all(), positions
+
+
+def test_goals_that_nothing_else_shows_are_in_the_cloud():
+    env = MetaworldPointCloudEnv("reach", n_points=512)
+    observation, _ = env.reset(seed=3)
+    distance = np.linalg.norm(observation["point_cloud"] - env._simulator._target_pos, axis=1)
+    assert (np.abs(distance - 0.02) < 1e-4).sum() >= 3
+
+
+def test_the_papers_tasks_have_its_counts():
+    groups = task_groups()
+    counts = [len(set(groups["paper"]) & set(groups[name])) for name in ("easy", "medium", "hard", "very_hard")]
+    assert counts == [21, 4, 4, 5]
+    assert len(groups["all"]) == 50
+
+
+def test_suites_are_the_entries_of_the_task_option():
+    config = make_env_config("metaworld_pointcloud", task="hard, dial-turn-v3")
+    assert list(config.tasks()) == ["hard", "dial-turn"]
+    assert len(config.tasks()["hard"]) == 6
+
+
+# Bad input ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_task_names_the_valid_ones_nearest_first():
+    with pytest.raises(UserError, match=r"Unknown task 'hamer'\. Meta-World tasks: hammer, .*; groups: easy, .*all\."):
+        make_env_config("metaworld_pointcloud", task="hamer").create_envs(1)
+
+
+@pytest.mark.parametrize("task", ["", " , ", None])
+def test_no_task(task):
+    with pytest.raises(UserError, match="No task given"):
+        make_env_config("metaworld_pointcloud", task=task).get_env_processors()
+
+
+def test_no_points():
+    with pytest.raises(UserError, match=r"env\.n_points must be at least 1, got 0"):
+        make_env_config("metaworld_pointcloud", n_points=0).create_envs(1)
+
+
+@pytest.mark.parametrize("action", [np.zeros(3), np.array([0, np.nan, 0, 0])])
+def test_actions_that_are_none(env, action):
+    with pytest.raises(UserError, match="an action must be 4 finite numbers"):
+        env.step(action)
+
+
+def test_a_step_before_the_first_reset():
+    with pytest.raises(UserError, match=r"call reset\(\) first"):
+        MetaworldPointCloudEnv("reach").step(np.zeros(4))
+
+
+def test_an_empty_cloud_names_task_camera_and_crop(monkeypatch):
+    monkeypatch.setattr(metaworld, "CROP", Crop((5, 5, 5), (6, 6, 6)))
+    with pytest.raises(
+        UserError, match=r"reach: the cloud is empty\. Camera corner2 at .*crop \(5, 5, 5\) to \(6, 6, 6\)"
+    ):
+        MetaworldPointCloudEnv("reach").reset(seed=0)

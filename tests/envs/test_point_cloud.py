@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+
+from lerobot_uca.envs.point_cloud import Camera, Crop, ray_sphere_distances, sample_farthest, shade
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def camera(width: int = 4, height: int = 2, fovy: float = 90.0) -> Camera:
+    return Camera("test", (0.0, 0.0, 0.0), IDENTITY, fovy, width, height)
+
+
+def test_rays_of_a_small_camera_are_those_computed_by_hand():
+    # fovy 90 and two rows: the focal length is one pixel, so pixel centres lie 0.5 up or down, 0.5 or 1.5 sideways.
+    directions = camera().ray_directions()
+    expected = np.array([[x, y, -1] for y in (0.5, -0.5) for x in (-1.5, -0.5, 0.5, 1.5)])
+    np.testing.assert_allclose(directions, expected / np.linalg.norm(expected, axis=1, keepdims=True))
+
+
+def test_rotation_turns_the_camera_frame_into_the_world_frame():
+    looks_along_x = ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # camera x, y, z in the world: -y, z, -x
+    mean = Camera("test", (0.0, 0.0, 0.0), looks_along_x, 60.0, 8, 8).ray_directions().mean(axis=0)
+    np.testing.assert_allclose(mean / np.linalg.norm(mean), [1, 0, 0], atol=1e-12)
+
+
+def test_a_ray_meets_a_crop_exactly_if_one_of_its_points_lies_inside():
+    rng = np.random.default_rng(0)
+    crop = Crop((-0.3, 0.2, 1.0), (0.4, 0.9, 1.5))
+    origin = np.array([1.0, -1.0, 0.5])
+    directions = rng.normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    along = np.linspace(0, 4, 4001)
+    inside = np.array([crop.contains(origin + along[:, None] * direction).any() for direction in directions])
+    meets = crop.meets(origin, directions)
+    assert meets[inside].all()  # never throws a point away
+    assert (meets & ~inside).sum() <= 2  # only rays that graze an edge between two of the 1 mm steps
+    assert 0 < inside.sum() < len(inside)
+
+
+def test_a_ray_parallel_to_a_face_is_judged_by_the_other_axes():
+    crop = Crop((0, 0, 0), (1, 1, 1))
+    direction = np.array([[1.0, 0.0, 0.0]])
+    assert crop.meets(np.array([-1.0, 0.5, 0.5]), direction).all()
+    assert not crop.meets(np.array([-1.0, 1.5, 0.5]), direction).any()
+    assert not crop.meets(np.array([2.0, 0.5, 0.5]), direction).any()  # behind the origin
+
+
+def test_distance_to_a_sphere():
+    directions = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0]])
+    distances = ray_sphere_distances(np.zeros(3), directions, np.array([3.0, 0.5, 0]), 1.0)
+    np.testing.assert_allclose(distances, [3 - np.sqrt(0.75), np.inf, np.inf])
+
+
+def test_sampling_takes_the_farthest_point_each_time():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500, 3)).astype(np.float32)
+    sample = sample_farthest(points, 40)
+    assert sample.dtype == np.float32
+    np.testing.assert_array_equal(sample, sample_farthest(points, 40))
+    for n in range(1, 40):
+        distance = np.linalg.norm(points[:, None] - sample[None, :n], axis=2).min(axis=1)
+        nearest = np.linalg.norm(sample[n] - sample[:n], axis=1).min()
+        assert nearest == pytest.approx(distance.max(), rel=1e-5)
+
+
+def test_a_shorter_sample_is_the_beginning_of_a_longer_one():
+    points = np.random.default_rng(0).normal(size=(800, 3))
+    np.testing.assert_array_equal(sample_farthest(points, 128), sample_farthest(points, 512)[:128])
+
+
+def test_too_few_points_are_repeated_in_turn():
+    points = np.random.default_rng(0).normal(size=(5, 3)) + 10
+    sample = sample_farthest(points, 12)
+    np.testing.assert_array_equal(sample[:5], sample[5:10])
+    assert len(np.unique(sample, axis=0)) == 5
+    assert (sample > 1).all()  # no zeros
+
+
+def test_an_empty_cloud_is_an_error():
+    with pytest.raises(ValueError, match="empty"):
+        sample_farthest(np.empty((0, 3)), 10)
+
+
+def test_surfaces_facing_the_camera_are_brighter():
+    colours = np.ones((2, 3))
+    directions = np.array([[0, 0, -1.0]] * 2)
+    picture = shade(colours, np.array([[0, 0, 1.0], [1.0, 0, 0]]), directions)
+    assert picture.dtype == np.uint8
+    assert (picture[0] == 255).all()
+    assert (picture[1] < picture[0]).all()

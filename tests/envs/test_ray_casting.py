@@ -1,0 +1,100 @@
+"""Ray casting against MuJoCo's own single-ray function, on a small scene with known geometry."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from lerobot_uca.envs.point_cloud import Camera, Crop
+from lerobot_uca.envs.ray_casting import BACKGROUND, Marker, PictureCamera, PointCloudCamera, surface_colours
+
+SCENE = """
+<mujoco>
+  <asset>
+    <texture name="grey" type="2d" builtin="flat" rgb1="0.5 0.5 0.5" width="4" height="4"/>
+    <material name="red" rgba="1 0 0 1"/>
+    <material name="textured" texture="grey" rgba="1 1 0 1"/>
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 0.1" material="textured"/>
+    <geom name="ball" type="sphere" size="0.2" pos="0 0 0.5" material="red"/>
+    <geom name="box" type="box" size="0.1 0.1 0.1" pos="0.5 0 0.1" rgba="0 0 1 1"/>
+    <geom name="collision_shape" type="sphere" size="0.4" pos="0 0 0.5" group="3"/>
+  </worldbody>
+</mujoco>
+"""
+LOOKING_DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+CAMERA = Camera("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, 40, 40)
+EVERYTHING = Crop((-9, -9, -9), (9, 9, 9))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    model = mujoco.MjModel.from_xml_string(SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def test_points_equal_those_of_single_rays(scene):
+    model, data = scene
+    origin = np.asarray(CAMERA.position)
+    expected = []
+    for direction in CAMERA.ray_directions():
+        hit = np.zeros(1, dtype=np.int32)
+        distance = mujoco.mj_ray(model, data, origin, direction, np.array([1, 1, 1, 0, 0, 0], np.uint8), 1, -1, hit)
+        if distance >= 0:
+            expected.append(origin + distance * direction)
+    points = PointCloudCamera(CAMERA, EVERYTHING).capture(model, data)
+    np.testing.assert_allclose(points, expected, atol=1e-9)
+
+
+def test_a_crop_keeps_exactly_the_points_inside(scene):
+    model, data = scene
+    crop = Crop((-0.3, -0.3, 0.05), (0.3, 0.3, 1.0))
+    everything = PointCloudCamera(CAMERA, EVERYTHING).capture(model, data)
+    inside = PointCloudCamera(CAMERA, crop).capture(model, data)
+    np.testing.assert_allclose(inside, everything[crop.contains(everything)])
+    np.testing.assert_allclose(np.linalg.norm(inside - [0, 0, 0.5], axis=1), 0.2, atol=1e-6)  # the ball, and it alone
+
+
+def test_markers_are_seen_and_hidden_like_solid_spheres(scene):
+    model, data = scene
+    above = Marker(np.array([0, 0, 1.0]), 0.1, np.ones(3))
+    below = Marker(np.array([0, 0, 0.1]), 0.1, np.ones(3))  # under the ball
+    camera = PointCloudCamera(CAMERA, EVERYTHING)
+    plain = camera.capture(model, data)
+    np.testing.assert_array_equal(camera.capture(model, data, [below]), plain)
+    changed = camera.capture(model, data, [above])
+    moved = np.abs(changed - plain).max(axis=1) > 0
+    assert moved.any()
+    np.testing.assert_allclose(np.linalg.norm(changed[moved] - above.centre, axis=1), 0.1, atol=1e-9)
+
+
+def test_a_picture_shows_surfaces_in_their_colours(scene):
+    model, data = scene
+    marker = Marker(np.array([-0.6, 0, 0.2]), 0.15, np.array([0, 1.0, 0]))
+    camera = Camera("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, 41, 41)
+    picture = PictureCamera(camera).capture(model, data, [marker])
+    assert picture.shape == (41, 41, 3)
+    assert picture.dtype == np.uint8
+    red, green, blue = picture[20, 20], picture[20, 9], picture[20, 29]
+    assert red[0] > 200
+    assert red[1:].max() == 0
+    assert green[1] > 150
+    assert green[[0, 2]].max() == 0
+    assert blue[2] > 150
+    assert blue[:2].max() == 0
+
+
+def test_where_there_is_nothing_the_picture_shows_the_background(scene):
+    model, data = scene
+    looking_up = Camera("up", (0.0, 0.0, 2.0), ((1.0, 0, 0), (0, -1.0, 0), (0, 0, -1.0)), 60.0, 8, 8)
+    assert (PictureCamera(looking_up).capture(model, data) == BACKGROUND).all()
+    assert len(PointCloudCamera(looking_up, EVERYTHING).capture(model, data)) == 0
+
+
+def test_colours_come_from_the_geom_its_material_and_texture(scene):
+    colours = surface_colours(scene[0])
+    np.testing.assert_allclose(colours[0], [128 / 255, 128 / 255, 0], atol=0.01)
+    np.testing.assert_allclose(colours[1], [1, 0, 0])
+    np.testing.assert_allclose(colours[2], [0, 0, 1])

@@ -1,0 +1,319 @@
+"""What LeRobot and its users rely on."""
+
+import copy
+import re
+
+import pytest
+import torch
+from lerobot.policies import make_policy_config, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config, make_observation
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+
+T = 4
+
+
+def history(*observations: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {key: torch.stack([observation[key] for observation in observations], dim=1) for key in observations[0]}
+
+
+def test_lerobot_finds_config_policy_and_processors():
+    assert isinstance(make_policy_config("uca_flow", device="cpu"), UCAFlowConfig)
+    assert get_policy_class("uca_flow") is UCAFlowPolicy
+    names = [step.get_config for step in make_pre_post_processors(make_config())[0].steps]
+    assert len(names) == 4
+
+
+def test_horizon_table():
+    """The table in PointCloudPolicyConfig's docstring."""
+    config = make_config()
+    assert config.observation_delta_indices == [-1, 0]
+    assert config.action_delta_indices == [-1, 0, 1, 2]
+    assert config.action_delta_indices[config.executed] == [0, 1, 2]
+    assert (config.executed.start, config.executed.stop) == (1, 4)
+
+
+@pytest.mark.parametrize(("n_obs_steps", "horizon", "n_action_steps"), [(1, 3, 3), (3, 16, 8), (2, 16, 15)])
+def test_execution_starts_at_the_current_step(n_obs_steps, horizon, n_action_steps):
+    config = make_config(n_obs_steps=n_obs_steps, horizon=horizon, n_action_steps=n_action_steps)
+    assert config.action_delta_indices[config.executed] == list(range(n_action_steps))
+    policy = UCAFlowPolicy(config).eval()
+    assert policy.predict_action_chunk(make_observation()).shape == (1, n_action_steps, N_ACTIONS)
+
+
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_three_actions_are_executed_from_each_prediction(policy, batch_size):
+    noise = torch.randn(batch_size, T, N_ACTIONS)
+    observations = [make_observation(batch_size) for _ in range(5)]
+    actions = [policy.select_action(observation, noise=noise) for observation in observations]
+    first = policy.predict_action_chunk(history(observations[0], observations[0]), noise=noise)
+    second = policy.predict_action_chunk(history(observations[2], observations[3]), noise=noise)
+    for step in range(3):
+        torch.testing.assert_close(actions[step], first[:, step])
+    for step in range(2):
+        torch.testing.assert_close(actions[3 + step], second[:, step])
+
+
+def test_predict_action_chunk_remembers_single_observations(policy):
+    """As asynchronous inference calls it: one frame at a time, and still with a history."""
+    noise = torch.randn(1, T, N_ACTIONS)
+    a, b = make_observation(), make_observation()
+    policy.predict_action_chunk(a, noise=noise)
+    torch.testing.assert_close(
+        policy.predict_action_chunk(b, noise=noise), policy.predict_action_chunk(history(a, b), noise=noise)
+    )
+
+
+def test_reset_forgets(policy):
+    noise, observation = torch.randn(1, T, N_ACTIONS), make_observation()
+    before = policy.select_action(observation, noise=noise)
+    policy.select_action(make_observation(), noise=noise)
+    policy.reset()
+    torch.testing.assert_close(policy.select_action(observation, noise=noise), before)
+
+
+def test_a_seed_reproduces_actions_and_losses(policy):
+    observation, batch = make_observation(), make_batch(policy.config)
+    runs = []
+    for _ in range(2):
+        torch.manual_seed(3)
+        policy.reset()
+        runs.append((policy.select_action(observation), policy.forward(batch)[0]))
+    assert torch.equal(runs[0][0], runs[1][0])
+    assert torch.equal(runs[0][1], runs[1][1])
+
+
+def test_one_network_call_makes_a_chunk(policy):
+    calls = []
+    policy.ema_model.generator.register_forward_hook(lambda *_: calls.append(1))
+    policy.predict_action_chunk(make_observation())
+    assert len(calls) == 1
+
+
+def test_only_the_first_n_points_are_looked_at():
+    policy = UCAFlowPolicy(make_config(n_points=10)).eval()
+    noise, observation = torch.randn(1, T, N_ACTIONS), make_observation()
+    changed = {**observation, OBS_POINT_CLOUD: observation[OBS_POINT_CLOUD].clone()}
+    changed[OBS_POINT_CLOUD][:, 10:] += 5
+    expected = policy.predict_action_chunk(history(observation, observation), noise=noise)
+    assert torch.equal(policy.predict_action_chunk(history(changed, changed), noise=noise), expected)
+
+
+def test_loss_of_a_batch_is_the_mean_of_its_samples(policy):
+    batch = make_batch(policy.config)
+    untouched = {key: value.clone() for key, value in batch.items()}
+    torch.manual_seed(1)
+    mean, parts = policy.forward(batch)
+    torch.manual_seed(1)
+    each, _ = policy.forward(batch, reduction="none")
+    assert each.shape == (8,)
+    torch.testing.assert_close(each.mean(), mean)
+    assert set(parts) == {"loss_u", "loss_v"}
+    assert all(isinstance(value, float) for value in parts.values())
+    assert parts["loss_u"] + parts["loss_v"] == pytest.approx(mean.item())
+    for key, value in batch.items():
+        assert torch.equal(value, untouched[key]), f"forward changed {key}"
+
+
+def test_padded_actions_do_not_change_the_loss_but_count_if_not_marked(policy):
+    batch = make_batch(policy.config)
+    batch["action_is_pad"][:, -1] = True
+    losses = []
+    for is_pad in (batch["action_is_pad"], torch.zeros_like(batch["action_is_pad"])):
+        torch.manual_seed(1)
+        losses.append(policy.forward({**batch, "action_is_pad": is_pad})[0])
+    assert losses[0] != losses[1]
+
+
+def test_without_dual_pass_only_u_is_supervised():
+    policy = UCAFlowPolicy(make_config(dual_pass=False))
+    assert set(policy.forward(make_batch(policy.config))[1]) == {"loss_u"}
+
+
+@pytest.mark.parametrize("dual_pass", [True, False])
+def test_overfitting_one_batch_drives_the_one_step_error_down(dual_pass):
+    policy = UCAFlowPolicy(make_config(dual_pass=dual_pass, ema_power=0.6))
+    batch = make_batch(policy.config, batch_size=4)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3)
+
+    def error() -> float:
+        policy.eval()
+        chunk = policy.predict_action_chunk(batch)
+        policy.train()
+        return (chunk - batch["action"][:, policy.config.executed]).abs().mean().item()
+
+    before = error()
+    repeated = {key: value.repeat(8, *[1] * (value.ndim - 1)) for key, value in batch.items()}
+    for _ in range(400):
+        loss, _ = policy.forward(repeated)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        policy.update()
+    assert error() < 0.2 * before
+
+
+def test_averaged_weights_follow_the_stated_schedule():
+    policy = UCAFlowPolicy(make_config())
+    weight = policy.model.generator.embed_action.weight
+    average = policy.ema_model.generator.embed_action.weight
+    expected = average.clone()
+    for step in range(1, 4):
+        with torch.no_grad():
+            weight.add_(1.0)
+        policy.update()
+        decay = 1 - (1 + step) ** -0.75
+        expected = decay * expected + (1 - decay) * weight
+        torch.testing.assert_close(average, expected)
+
+
+def test_training_uses_the_trained_weights_and_evaluation_their_average(policy):
+    noise, observation = torch.randn(1, T, N_ACTIONS), make_observation()
+    averaged = policy.eval().predict_action_chunk(history(observation, observation), noise=noise)
+    trained = policy.train().predict_action_chunk(history(observation, observation), noise=noise)
+    assert not torch.allclose(averaged, trained)
+    policy.ema_model = copy.deepcopy(policy.model)
+    same = policy.eval().predict_action_chunk(history(observation, observation), noise=noise)
+    torch.testing.assert_close(same, trained)
+
+
+def test_gradients_reach_all_trained_weights_and_no_averaged_one(policy):
+    policy.train().forward(make_batch(policy.config))[0].backward()
+    assert all(parameter.grad is not None for parameter in policy.model.parameters())
+    assert all(parameter.grad is None for parameter in policy.ema_model.parameters())
+    assert len(list(policy.get_optim_params())) == len(list(policy.model.parameters()))
+
+
+def test_a_loaded_checkpoint_gives_bit_equal_actions_and_can_be_trained_on(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    loaded = UCAFlowPolicy.from_pretrained(tmp_path)
+    noise, observation = torch.randn(2, T, N_ACTIONS), make_observation(2)
+    assert not loaded.training
+    assert torch.equal(loaded.select_action(observation, noise=noise), policy.select_action(observation, noise=noise))
+    for key, value in policy.state_dict().items():
+        assert torch.equal(loaded.state_dict()[key], value), key
+
+
+def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path):
+    stats = {
+        key: {"min": -torch.rand(size), "max": 1 + torch.rand(size), "mean": torch.zeros(size), "std": torch.ones(size)}
+        for key, size in ((OBS_POINT_CLOUD, 3), ("observation.state", N_STATES), ("action", N_ACTIONS))
+    }
+    pre, post = make_pre_post_processors(policy.config, dataset_stats=stats)
+    pre.save_pretrained(tmp_path)
+    post.save_pretrained(tmp_path)
+    loaded_pre, loaded_post = make_pre_post_processors(policy.config, pretrained_path=str(tmp_path))
+    observation = make_observation(2)
+    trained, loaded = pre(dict(observation)), loaded_pre(dict(observation))
+    for key in observation:
+        assert torch.equal(trained[key], loaded[key])
+    low, high = stats[OBS_POINT_CLOUD]["min"], stats[OBS_POINT_CLOUD]["max"]
+    expected = 2 * (observation[OBS_POINT_CLOUD] - low) / (high - low) - 1
+    torch.testing.assert_close(loaded[OBS_POINT_CLOUD], expected)
+    action = torch.rand(2, N_ACTIONS)
+    assert torch.equal(post(action), loaded_post(action))
+
+
+# Bad input: the message says the rule, what was got and what is valid. --------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"horizon": 3}, "policy.horizon must be at least n_obs_steps + n_action_steps - 1 = 4, got 3"),
+        ({"n_action_steps": 0}, "policy.n_action_steps must be at least 1, got 0"),
+        ({"n_points": 0}, "policy.n_points must be at least 1 or null (all points), got 0"),
+        ({"dtype": "float16"}, "policy.dtype must be float32 or bfloat16, got 'float16'"),
+        ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
+        ({"n_layers": 0}, "policy.n_layers must be at least 1, got 0"),
+    ],
+)
+def test_wrong_settings(changes, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        UCAFlowPolicy(make_config(**changes))
+
+
+@pytest.mark.parametrize("missing", [OBS_POINT_CLOUD, "observation.state"])
+def test_a_dataset_without_cloud_or_state(missing):
+    config = make_config()
+    del config.input_features[missing]
+    with pytest.raises(UserError, match=f"needs the feature '{missing}'"):
+        UCAFlowPolicy(config)
+
+
+def test_a_cloud_with_too_few_points_for_the_policy():
+    with pytest.raises(UserError, match=r"must have shape \(N, 3\) with N at least 100 .* got \(32, 3\)"):
+        UCAFlowPolicy(make_config(n_points=100))
+
+
+def test_features_the_policy_does_not_use_are_left_out():
+    config = make_config()
+    config.input_features["observation.extra"] = config.input_features["observation.state"]
+    assert set(UCAFlowPolicy(config).config.input_features) == {OBS_POINT_CLOUD, "observation.state"}
+
+
+@pytest.mark.parametrize(
+    ("key", "shape"),
+    [
+        (OBS_POINT_CLOUD, (8, 2, N_POINTS, 4)),
+        (OBS_POINT_CLOUD, (8, 3, N_POINTS, 3)),
+        ("observation.state", (8, 2, N_STATES + 1)),
+        ("action", (8, 5, N_ACTIONS)),
+    ],
+)
+def test_wrong_shapes(policy, key, shape):
+    batch = {**make_batch(policy.config), key: torch.zeros(shape)}
+    with pytest.raises(UserError, match=re.escape(f"'{key}' must have shape") + ".*" + re.escape(f"got {shape}")):
+        policy.forward(batch)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("key", [OBS_POINT_CLOUD, "observation.state"])
+def test_nan_and_infinite_observations_never_become_actions(policy, key, value):
+    observation = make_observation()
+    observation[key].view(-1)[7] = value
+    with pytest.raises(UserError, match=f"'{key}' must be finite, got"):
+        policy.select_action(observation)
+    batch = make_batch(policy.config)
+    batch[key].view(-1)[7] = value
+    with pytest.raises(UserError, match=f"'{key}' must be finite, got 1 of"):
+        policy.forward(batch)
+
+
+def test_a_checkpoint_of_another_policy_type(tmp_path):
+    act = make_policy_config("act", device="cpu", input_features={}, output_features={})
+    with pytest.raises(
+        UserError, match="needs a configuration or checkpoint of policy type 'uca_flow', got one of type 'act'"
+    ):
+        UCAFlowPolicy(act)
+
+
+def test_a_truncated_checkpoint(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    with pytest.raises(UserError, match=r"model\.safetensors' does not hold the weights of this 'uca_flow' policy"):
+        UCAFlowPolicy.from_pretrained(tmp_path)
+
+
+def test_a_checkpoint_with_missing_weights_is_refused(policy, tmp_path):
+    """LeRobot would only warn and evaluate a half-random policy."""
+    from safetensors.torch import load_file, save_file
+
+    policy.save_pretrained(tmp_path)
+    weights = load_file(tmp_path / "model.safetensors")
+    del weights["ema_model.generator.embed_action.weight"]
+    save_file(weights, tmp_path / "model.safetensors")
+    with pytest.raises(UserError, match=r"ema_model\.generator\.embed_action\.weight"):
+        UCAFlowPolicy.from_pretrained(tmp_path)
+
+
+def test_a_checkpoint_without_weights(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    (tmp_path / "model.safetensors").unlink()
+    with pytest.raises(UserError, match="has no weights"):
+        UCAFlowPolicy.from_pretrained(tmp_path)

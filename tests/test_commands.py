@@ -1,0 +1,179 @@
+"""The public commands, end to end and tiny, as a user types them."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors.torch import load_file
+
+from lerobot_uca.features import OBS_POINT_CLOUD
+from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, write_dataset
+
+BIN = Path(sys.executable).parent
+ENVIRONMENT = ["--env.type=metaworld_pointcloud", "--env.task=drawer-close", f"--env.n_points={N_POINTS}"]
+TINY = [
+    *("--policy.type=uca_flow", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim=16"),
+    *("--policy.n_layers=1", "--policy.n_heads=2", "--batch_size=4", "--steps=2", "--num_workers=0", "--log_freq=1"),
+]
+
+
+def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    program, *arguments = map(str, command)
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    return subprocess.run([BIN / program, *arguments], capture_output=True, text=True, env=environment, check=False)
+
+
+def succeed(*command: str | Path) -> str:
+    result = run(*command)
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout + result.stderr
+
+
+def fail(*command: str | Path) -> str:
+    """The one line in which a failing command says what is wrong; there must be no traceback."""
+    result = run(*command)
+    assert result.returncode != 0
+    assert "Traceback" not in result.stderr, result.stderr[-3000:]
+    (line,) = re.findall(r"error: .*", result.stderr)
+    return line
+
+
+def train(root: Path, output: Path, *options: str) -> list[str | Path]:
+    return [
+        "lerobot-train",
+        *TINY,
+        "--dataset.repo_id=test/data",
+        f"--dataset.root={root}",
+        f"--output_dir={output}",
+        *options,
+    ]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """Folder in which demonstrations were collected and a policy trained for two steps, by the commands."""
+    folder = tmp_path_factory.mktemp("run")
+    output = succeed(
+        "lerobot-uca-collect", *ENVIRONMENT, "--repo_id=test/data", f"--root={folder}/data", "--n_episodes=1"
+    )
+    assert "1 episodes, 200 frames, seeds from 1000000" in output
+    assert "torchcodec" not in output
+    log = succeed(*train(folder / "data", folder / "train"))
+    assert "torchcodec" not in log
+    assert re.search(r"loss_u:\d", log)
+    assert re.search(r"loss_v:\d", log)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def checkpoint(trained) -> Path:
+    return trained / "train" / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_a_checkpoint_is_safetensors_with_processors_and_both_sets_of_weights(checkpoint):
+    names = {path.name for path in checkpoint.iterdir()}
+    assert {"config.json", "model.safetensors", "policy_preprocessor.json", "policy_postprocessor.json"} <= names
+    assert not [name for name in names if name.endswith((".bin", ".pkl", ".pt", ".ckpt"))]
+    weights = load_file(checkpoint / "model.safetensors")
+    assert weights["ema_step"] == 2
+    assert {key.split(".")[0] for key in weights} == {"model", "ema_model", "ema_step"}
+
+
+def test_evaluation_reports_success_and_videos(checkpoint, tmp_path):
+    log = succeed(
+        "lerobot-eval", f"--policy.path={checkpoint}", *ENVIRONMENT, "--eval.n_episodes=1", f"--output_dir={tmp_path}"
+    )
+    assert "torchcodec" not in log
+    overall = json.loads((tmp_path / "eval_info.json").read_text())["overall"]
+    assert overall["n_episodes"] == 1
+    assert overall["pc_success"] in (0.0, 100.0)
+    assert Path(overall["video_paths"][0]).stat().st_size > 1000
+
+
+def test_training_resumes_with_its_averaged_weights(trained):
+    config = trained / "train" / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    succeed("lerobot-train", f"--config_path={config}", "--resume=true", "--steps=3")
+    weights = load_file(trained / "train" / "checkpoints" / "000003" / "pretrained_model" / "model.safetensors")
+    assert weights["ema_step"] == 3
+
+
+def test_training_evaluates_in_the_environment(trained, tmp_path):
+    evaluation = [*ENVIRONMENT, "--env_eval_freq=2", "--eval.n_episodes=1", "--policy.dtype=bfloat16"]
+    log = succeed(*train(trained / "data", tmp_path / "train", *evaluation))
+    assert "pc_success" in log
+
+
+def test_help_lists_and_teaches():
+    assert "uca_flow" in succeed("lerobot-train", "--help")
+    scoped = succeed("lerobot-train", "--policy.type=uca_flow", "--env.type=metaworld_pointcloud", "--help")
+    assert "--policy.dual_pass" in scoped
+    assert "--env.n_points" in scoped
+    collect = succeed("lerobot-uca-collect", "--help")
+    for option in ("--repo_id", "--n_episodes", "--overwrite", "--push_to_hub", "--seed"):
+        assert option in collect
+
+
+# Bad input: one line, an exit code that is not 0, nothing half-written. ---------------------------------------------
+
+
+def test_an_unknown_task(tmp_path):
+    line = fail(
+        "lerobot-uca-collect",
+        "--env.type=metaworld_pointcloud",
+        "--env.task=hamer",
+        "--repo_id=a/b",
+        f"--root={tmp_path}/d",
+    )
+    assert line.startswith("error: Unknown task 'hamer'. Meta-World tasks: hammer, ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_training_finds_an_unknown_task_before_its_first_step(dataset_root, tmp_path):
+    line = fail(*train(dataset_root, tmp_path / "train", "--env.type=metaworld_pointcloud", "--env.task=dial-tun"))
+    assert line.startswith("error: Unknown task 'dial-tun'. Meta-World tasks: dial-turn, ")
+    assert not (tmp_path / "train").exists()
+
+
+def test_a_dataset_without_a_cloud(tmp_path):
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (N_STATES,), "names": None},
+        "action": {"dtype": "float32", "shape": (N_ACTIONS,), "names": None},
+    }
+    write_dataset(tmp_path / "data", features=features)
+    line = fail(*train(tmp_path / "data", tmp_path / "train"))
+    expected = f"error: Policy 'uca_flow' needs the feature '{OBS_POINT_CLOUD}' of shape (N, 3), got observation.state."
+    assert line == expected
+    assert not (tmp_path / "train").exists()
+
+
+def test_a_dataset_with_nan_points(tmp_path):
+    import numpy as np
+
+    cloud = np.zeros((N_POINTS, 3), np.float32)
+    cloud[3, 1] = np.nan
+    write_dataset(tmp_path / "data", point_cloud=cloud)
+    line = fail(*train(tmp_path / "data", tmp_path / "train"))
+    assert re.match(rf"error: '{OBS_POINT_CLOUD}' must be finite, got \d+ of \d+ values NaN or infinite", line)
+    assert not (tmp_path / "train").exists()
+
+
+def test_a_horizon_that_is_too_short(dataset_root, tmp_path):
+    line = fail(*train(dataset_root, tmp_path / "train", "--policy.horizon=3"))
+    assert line.startswith("error: policy.horizon must be at least n_obs_steps + n_action_steps - 1 = 4, got 3")
+
+
+def test_an_output_folder_that_cannot_be_written(dataset_root, tmp_path):
+    (tmp_path / "file").write_text("")
+    command = ["lerobot-uca-collect", *ENVIRONMENT, "--repo_id=a/b", "--n_episodes=1", f"--root={tmp_path}/file/data"]
+    assert fail(*command).startswith(f"error: Cannot write '{tmp_path}/file/data'")
+
+
+def test_collected_data_opens_as_any_lerobot_dataset(trained):
+    dataset = LeRobotDataset("test/data", root=trained / "data")
+    assert dataset.num_episodes == 1
+    assert dataset[0][OBS_POINT_CLOUD].shape == (N_POINTS, 3)
