@@ -8,7 +8,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env_config
 
 from lerobot_uca.data import collect as collecting
-from lerobot_uca.data.collect import CollectConfig, collect, demonstrate
+from lerobot_uca.data.collect import CollectConfig, collect
+from lerobot_uca.data.demonstrations import Demonstration, demonstrate
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
@@ -97,7 +98,7 @@ def test_an_overwrite_that_dies_keeps_the_old_dataset(collected, tmp_path):
 
 
 def test_an_expert_that_fails_is_reported(tmp_path, monkeypatch):
-    failed = collecting.Demonstration(*(np.zeros((3, 1)) for _ in range(3)), success=np.zeros(3, dtype=bool))
+    failed = Demonstration(*(np.zeros((3, 1)) for _ in range(3)), success=np.zeros(3, dtype=bool))
     monkeypatch.setattr(collecting, "demonstrations", lambda *_: iter([failed] * 1000))
     with pytest.raises(UserError, match="The expert of 'drawer-close' succeeded in 0 of 20 episodes, 1 are wanted"):
         collect(config(tmp_path / "drawer"))

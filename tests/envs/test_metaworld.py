@@ -100,7 +100,7 @@ def test_vector_environments_give_the_episodes_of_single_ones(use_async_envs):
         actions = np.full((2, 4), 0.5, dtype=np.float32)
         stepped, *_, info = vector.step(actions)
         assert info["is_success"].tolist() == [False, False]
-        assert vector.call("render")[0].shape == (384, 384, 3)
+        assert vector.call("render")[0].shape == (320, 320, 3)
     finally:
         vector.close()
     for index, seed in enumerate((5, 6)):
@@ -135,7 +135,7 @@ def test_rendering_needs_no_opengl(env, monkeypatch):
     for name in ("DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM"):
         monkeypatch.delenv(name, raising=False)
     picture = env.render()
-    assert picture.shape == (384, 384, 3)
+    assert picture.shape == (320, 320, 3)
     assert picture.std() > 10
     assert "OpenGL" not in {name.split(".")[0] for name in os.sys.modules}
 

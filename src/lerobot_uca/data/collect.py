@@ -4,29 +4,22 @@ Example:
     lerobot-uca-collect --env.type=metaworld_pointcloud --env.task=dial-turn --repo_id=local/dial-turn
 """
 
-import multiprocessing
-import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import gymnasium as gym
-import numpy as np
 from lerobot.configs import parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import SuppressProgressBars
-from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lerobot_uca.envs.configs import Expert, PointCloudEnvConfig
+from lerobot_uca.data.demonstrations import demonstrations
+from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -64,45 +57,6 @@ class CollectConfig:
     overwrite: bool = False
     push_to_hub: bool = False
     private: bool = False
-
-
-class Demonstration(NamedTuple):
-    """One episode: what was seen before each of L steps, what was done, and whether the step ended in success."""
-
-    point_cloud: NDArray[np.float32]  # (L, N, 3)
-    state: NDArray[np.float32]  # (L, S)
-    action: NDArray[np.float32]  # (L, A), as executed
-    success: NDArray[np.bool_]  # (L,)
-
-
-def demonstrate(env_factory: Callable[[], gym.Env], expert_factory: Callable[[], Expert], seed: int) -> Demonstration:
-    """Run the expert for a whole episode, also past its first success."""
-    env, expert = env_factory(), expert_factory()
-    observation, _ = env.reset(seed=seed)
-    steps: list[tuple[Any, ...]] = []
-    truncated = False
-    while not truncated:
-        action = expert(env)
-        before = observation
-        observation, _, _, truncated, info = env.step(action)
-        steps.append((before["point_cloud"], before["agent_pos"], action, info["is_success"]))
-    env.close()
-    return Demonstration(*(np.stack(column) for column in zip(*steps, strict=True)))
-
-
-def demonstrations(env_config: PointCloudEnvConfig, task: str, first_seed: int) -> Iterator[Demonstration]:
-    """Episodes of seeds first_seed, first_seed + 1, ... in this order, made by one process a core."""
-    make_env, make_expert = env_config.env_factory(task), env_config.expert_factory(task)
-    n_workers = os.cpu_count() or 1
-    with ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context("forkserver")) as pool:
-        seeds = count(first_seed)
-        pending = [pool.submit(demonstrate, make_env, make_expert, next(seeds)) for _ in range(n_workers + 1)]
-        try:
-            while True:
-                pending.append(pool.submit(demonstrate, make_env, make_expert, next(seeds)))
-                yield pending.pop(0).result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def collect(config: CollectConfig) -> LeRobotDataset:
@@ -164,9 +118,10 @@ def _collect_task(
     dataset: LeRobotDataset, env_config: PointCloudEnvConfig, task: str, n_episodes: int, first_seed: int
 ) -> None:
     description = env_config.task_description(task)
+    episodes = demonstrations(env_config.env_factory(task), env_config.expert_factory(task), first_seed)
     n_kept = 0
     with tqdm(total=n_episodes, desc=f"Demonstrations of {task}", unit="episode") as progress:
-        for n_tried, episode in enumerate(demonstrations(env_config, task, first_seed), start=1):
+        for n_tried, episode in enumerate(episodes, start=1):
             if episode.success.sum() >= MIN_SUCCESSFUL_STEPS:
                 for point_cloud, state, action, _ in zip(*episode, strict=True):
                     dataset.add_frame(

@@ -6,20 +6,16 @@ from functools import partial
 from typing import Any, override
 
 import gymnasium as gym
-import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_STATE
-from numpy.typing import NDArray
 
 from lerobot_uca.envs import metaworld
+from lerobot_uca.envs.expert import Expert
 from lerobot_uca.envs.task_names import resolve_tasks
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
-
-Expert = Callable[[Any], NDArray[np.float32]]
-"""From an environment to the action that a demonstrator would take in its present state."""
 
 
 @dataclass

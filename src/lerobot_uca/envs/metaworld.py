@@ -30,8 +30,8 @@ def corner2(width: int, height: int) -> Camera:
 
 
 CLOUD_CAMERA = corner2(128, 128)
-PICTURE_CAMERA = corner2(192, 192)
-PICTURE_ZOOM = 2  # each ray becomes 2 x 2 pixels: 384 x 384 is large enough to look at, and four times cheaper
+PICTURE_CAMERA = corner2(160, 160)
+PICTURE_ZOOM = 2  # each ray becomes 2 x 2 pixels: 320 x 320 is large enough to look at, and four times cheaper
 
 # The crop decides how well a policy learns, because every point on the table, the retaining wall around it or the
 # upper arm is one fewer on the task: it is as tight as the 50 tasks' objects and goals allow.
@@ -142,7 +142,7 @@ class MetaworldPointCloudEnv(gym.Env[Any, Any]):
         return self._observe(), float(reward), success, self._n_steps >= EPISODE_LENGTH, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
-        """The scene as a shaded ray-cast picture, (384, 384, 3) uint8."""
+        """The scene as a shaded ray-cast picture, (320, 320, 3) uint8."""
         simulator = self._running_simulator()
         self._picture_camera = self._picture_camera or PictureCamera(PICTURE_CAMERA)
         picture = self._picture_camera.capture(simulator.model, simulator.data, self._markers())
