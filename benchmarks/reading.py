@@ -103,7 +103,7 @@ def open_dataset(root: Path) -> LeRobotDataset:
 def write(root: Path, n_episodes: int, length: int, n_points: int) -> None:
     """A dataset of random numbers."""
     rng = np.random.default_rng(0)
-    features = {
+    features: dict[str, dict[str, Any]] = {
         OBS_POINT_CLOUD: {"dtype": "float32", "shape": (n_points, 3), "names": None},
         "observation.state": {"dtype": "float32", "shape": (9,), "names": None},
         "action": {"dtype": "float32", "shape": (4,), "names": None},

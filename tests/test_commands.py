@@ -22,21 +22,21 @@ TINY = [
 ]
 
 
-def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+def run(*command: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
     program, *arguments = map(str, command)
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", **variables}
     return subprocess.run([BIN / program, *arguments], capture_output=True, text=True, env=environment, check=False)
 
 
-def succeed(*command: str | Path) -> str:
-    result = run(*command)
+def succeed(*command: str | Path, **variables: str) -> str:
+    result = run(*command, **variables)
     assert result.returncode == 0, result.stderr[-3000:]
     return result.stdout + result.stderr
 
 
-def fail(*command: str | Path) -> str:
+def fail(*command: str | Path, **variables: str) -> str:
     """The one line in which a failing command says what is wrong; there must be no traceback."""
-    result = run(*command)
+    result = run(*command, **variables)
     assert result.returncode != 0
     assert "Traceback" not in result.stderr, result.stderr[-3000:]
     (line,) = re.findall(r"error: .*", result.stderr)
@@ -171,6 +171,13 @@ def test_an_output_folder_that_cannot_be_written(dataset_root, tmp_path):
     (tmp_path / "file").write_text("")
     command = ["lerobot-uca-collect", *ENVIRONMENT, "--repo_id=a/b", "--n_episodes=1", f"--root={tmp_path}/file/data"]
     assert fail(*command).startswith(f"error: Cannot write '{tmp_path}/file/data'")
+
+
+def test_an_upload_that_fails_says_that_the_dataset_is_safe(tmp_path):
+    command = ["lerobot-uca-collect", *ENVIRONMENT, "--repo_id=a/b", "--n_episodes=1", f"--root={tmp_path}/data"]
+    line = fail(*command, "--push_to_hub", HF_HUB_OFFLINE="1")
+    assert line.startswith(f"error: The dataset in '{tmp_path}/data' is complete but could not be uploaded: ")
+    assert (tmp_path / "data" / "meta" / "info.json").exists()
 
 
 def test_collected_data_opens_as_any_lerobot_dataset(trained):

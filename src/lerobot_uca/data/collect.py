@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import httpx
+from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 from lerobot.configs import parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
@@ -46,7 +48,7 @@ class CollectConfig:
             (LeRobot's start at 1000), or the policy is tested on what it has seen.
         overwrite: replace the folder if it exists.
         push_to_hub: upload the dataset to the Hugging Face Hub under repo_id.
-        private: upload as a private dataset.
+        private: upload as a private dataset; by default as the account's settings say.
     """
 
     env: EnvConfig
@@ -56,7 +58,7 @@ class CollectConfig:
     seed: int = FIRST_SEED
     overwrite: bool = False
     push_to_hub: bool = False
-    private: bool = False
+    private: bool | None = None
 
 
 def collect(config: CollectConfig) -> LeRobotDataset:
@@ -95,7 +97,11 @@ def collect(config: CollectConfig) -> LeRobotDataset:
         _remove(unfinished)
     dataset = LeRobotDataset(config.repo_id, root=root)
     if config.push_to_hub:
-        dataset.push_to_hub(private=config.private, tags=["uca_flow", "point-cloud", env_config.type])
+        try:
+            dataset.push_to_hub(private=config.private, tags=["point-cloud", env_config.type])
+        except (HfHubHTTPError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
+            reason = str(error).strip().splitlines()[0]
+            raise UserError(f"The dataset in '{root}' is complete but could not be uploaded: {reason}") from error
     return dataset
 
 
