@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 TASK = "drawer-close"
 N_EPISODES = 50
@@ -20,43 +21,66 @@ PICTURE = OUTPUT / "prediction.png"
 ENVIRONMENT = f"--env.type=metaworld_pointcloud --env.task={TASK}"
 
 
-def main() -> None:
-    """Collect, train, evaluate, draw, report."""
-    OUTPUT.mkdir(parents=True, exist_ok=True)
-    print(f"UCA-Flow quickstart: {TASK}. Everything goes to {OUTPUT}.")
-    run(
+class Step(NamedTuple):
+    """A command, what it writes, and the file that is there when it is complete."""
+
+    command: str
+    output: Path
+    complete: Path
+
+
+STEPS = (
+    Step(
         f"lerobot-uca-collect {ENVIRONMENT} --repo_id=local/{TASK} --root={DATASET}",
-        complete=DATASET / "meta" / "info.json",
-    )
-    run(
+        DATASET,
+        DATASET / "meta" / "info.json",
+    ),
+    Step(
         f"lerobot-train --config_path=configs/uca_flow_small.yaml --dataset.repo_id=local/{TASK} "
         f"--dataset.root={DATASET} --output_dir={TRAINING}",
-        complete=CHECKPOINT / "model.safetensors",
-        start_over=TRAINING,
-    )
-    run(
+        TRAINING,
+        CHECKPOINT / "model.safetensors",
+    ),
+    Step(
         f"lerobot-eval --policy.path={CHECKPOINT} {ENVIRONMENT} --eval.n_episodes={N_EPISODES} --eval.batch_size=2 "
         f"--output_dir={EVALUATION}",
-        complete=EVALUATION / "eval_info.json",
-    )
-    run(
+        EVALUATION,
+        EVALUATION / "eval_info.json",
+    ),
+    Step(
         f"python examples/draw_prediction.py --checkpoint={CHECKPOINT} --task={TASK} --output={PICTURE}",
-        complete=PICTURE,
-    )
+        PICTURE,
+        PICTURE,
+    ),
+)
+
+
+def main() -> None:
+    """Run the steps that are not complete, then report."""
+    print(f"UCA-Flow quickstart: Meta-World's {TASK}. To repeat a command: source .venv/bin/activate")
+    for index, step in enumerate(STEPS):
+        print(f"\n$ {step.command}", flush=True)
+        if step.complete.exists():
+            print(f"  (complete: {step.complete})")
+            continue
+        for outdated in STEPS[index:]:  # what is left of a killed run, and what was made from older results
+            remove(outdated.output)
+        run(step.command)
     report()
 
 
-def run(command: str, *, complete: Path, start_over: Path | None = None) -> None:
-    """Run a command unless the file it ends with is there. `start_over` is removed first if it was left half-done."""
-    print(f"\n$ {command}", flush=True)
-    if complete.exists():
-        print(f"  (complete: {complete})")
-        return
-    if start_over is not None:
-        shutil.rmtree(start_over, ignore_errors=True)
+def remove(path: Path) -> None:
+    """Remove a file or folder if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def run(command: str) -> None:
+    """Run a command of this interpreter's environment, whether or not it is activated."""
     program, *arguments = shlex.split(command)
     start = time.monotonic()
-    # The commands of this interpreter's environment, whether or not it is activated.
     result = subprocess.run([Path(sys.executable).with_name(program), *arguments], check=False)
     if result.returncode:
         sys.exit(f"error: the command above ended with exit code {result.returncode}")
@@ -70,8 +94,9 @@ def report() -> None:
         "task": f"Meta-World {TASK}",
         "success": f"{overall['pc_success']:.0f} % of {overall['n_episodes']} episodes",
         "evaluation": f"{overall['eval_ep_s']:.1f} s an episode",
-        "videos": str(Path(overall["video_paths"][0]).parent),
+        "video": f"{overall['video_paths'][0]} and {len(overall['video_paths']) - 1} more",
         "picture": str(PICTURE),
+        "checkpoint": str(CHECKPOINT),
     }
     width = max(map(len, rows))
     print("\n" + "\n".join(f"{name:>{width}}  {value}" for name, value in rows.items()))

@@ -8,7 +8,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
 from safetensors.torch import load_file
 
 from lerobot_uca.features import OBS_POINT_CLOUD
@@ -82,6 +85,19 @@ def test_a_checkpoint_is_safetensors_with_processors_and_both_sets_of_weights(ch
     weights = load_file(checkpoint / "model.safetensors")
     assert weights["ema_step"] == 2
     assert {key.split(".")[0] for key in weights} == {"model", "ema_model", "ema_step"}
+
+
+def test_the_checkpoints_preprocessor_normalises_with_the_datasets_statistics(trained, checkpoint):
+    dataset = LeRobotDataset("test/data", root=trained / "data")
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    preprocess, _ = make_pre_post_processors(config, pretrained_path=str(checkpoint))
+    cloud = dataset[7][OBS_POINT_CLOUD]
+    low, high = (
+        torch.as_tensor(dataset.meta.stats[OBS_POINT_CLOUD][key], dtype=torch.float32) for key in ("min", "max")
+    )
+    got = preprocess({OBS_POINT_CLOUD: cloud[None]})[OBS_POINT_CLOUD]
+    torch.testing.assert_close(got, 2 * (cloud[None] - low) / (high - low) - 1)
+    assert got.abs().max() <= 1 + 1e-6
 
 
 def test_evaluation_reports_success_and_videos(checkpoint, tmp_path):
@@ -167,7 +183,19 @@ def test_a_horizon_that_is_too_short(dataset_root, tmp_path):
     assert line.startswith("error: policy.horizon must be at least n_obs_steps + n_action_steps - 1 = 4, got 3")
 
 
-def test_an_output_folder_that_cannot_be_written(dataset_root, tmp_path):
+def test_training_into_a_folder_that_cannot_be_written(dataset_root, tmp_path):
+    (tmp_path / "file").write_text("")
+    line = fail(*train(dataset_root, tmp_path / "file" / "train"))
+    assert line.startswith(f"error: output_dir '{tmp_path}/file/train' cannot be written: '{tmp_path}/file' is not")
+
+
+def test_evaluation_into_a_folder_that_cannot_be_written(checkpoint, tmp_path):
+    (tmp_path / "file").write_text("")
+    command = ["lerobot-eval", f"--policy.path={checkpoint}", *ENVIRONMENT, "--eval.n_episodes=1"]
+    assert "Not a directory" in fail(*command, f"--output_dir={tmp_path}/file/evaluation")
+
+
+def test_collecting_into_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     command = ["lerobot-uca-collect", *ENVIRONMENT, "--repo_id=a/b", "--n_episodes=1", f"--root={tmp_path}/file/data"]
     assert fail(*command).startswith(f"error: Cannot write '{tmp_path}/file/data'")

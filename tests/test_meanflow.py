@@ -28,17 +28,22 @@ def sample() -> tuple[Tensor, Intervals, Tensor, Tensor]:
     return z, Intervals(t, h, n), torch.randn(B, N_OBS, F, dtype=torch.float64), e - x
 
 
+MEAN, STD = 1.5, 0.5
+
+
 def gaussian_velocity(z: Tensor, t: Tensor) -> Tensor:
-    """v for data and noise from N(0, I)."""
-    return (2 * t - 1) * z / ((1 - t) ** 2 + t**2)
+    """v for data from N(MEAN, STD^2) and noise from N(0, 1): dz/dt along the flow that scales and shifts z."""
+    variance = (1 - t) ** 2 * STD**2 + t**2
+    return -MEAN + (t - (1 - t) * STD**2) / variance * (z - (1 - t) * MEAN)
 
 
 def gaussian_average_velocity(z: Tensor, t: Tensor, h: Tensor, o: Tensor) -> Tensor:
-    """u for data and noise from N(0, I): the flow scales z by sigma."""
+    """u for the same: (z_t - z_r) / h with z_r on the flow through z_t."""
     t, h = t[:, None, None], h[:, None, None]
-    sigma_t, sigma_r = (((1 - s) ** 2 + s**2).sqrt() for s in (t, t - h))
+    sigma_t, sigma_r = (((1 - s) ** 2 * STD**2 + s**2).sqrt() for s in (t, t - h))
+    z_r = (1 - t + h) * MEAN + sigma_r / sigma_t * (z - (1 - t) * MEAN)
     instant = h == 0
-    average = z * (1 - sigma_r / sigma_t) / torch.where(instant, 1, h)
+    average = (z - z_r) / torch.where(instant, 1, h)
     return torch.where(instant, gaussian_velocity(z, t), average)
 
 
@@ -65,10 +70,10 @@ def test_identity_holds_on_the_analytic_gaussian_flow(sample):
     assert (wrong_sign - exact)[intervals.n_instants :].abs().max() > 0.1
 
 
-def test_one_step_turns_noise_into_gaussian_data():
+def test_one_step_turns_noise_into_data():
     e = torch.randn(100_000, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     x = one_step_sample(gaussian_average_velocity, e, torch.empty(len(e), 0))
-    torch.testing.assert_close(x, e)  # sigma_0 = sigma_1: the flow of this pair is the identity
+    torch.testing.assert_close(x, MEAN + STD * e)
 
 
 def test_composite_velocity_equals_the_plain_two_pass_version(network, sample):
@@ -189,7 +194,7 @@ def test_training_learns_to_sample_a_distribution_in_one_step():
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, 800)
     for _ in range(800):
-        x = 1.5 + 0.5 * torch.randn(256, 1, 1)
+        x = MEAN + STD * torch.randn(256, 1, 1)
         mask = torch.ones(256, 1, dtype=torch.bool)
         # gamma = 1: the squared error, whose minimum is the mean; wide intervals: [0, 1] itself must be learnt.
         settings = {"gamma": 1.0, "c": 1e-3, "interval_mean": 0.0, "interval_std": 2.0}
@@ -200,5 +205,5 @@ def test_training_learns_to_sample_a_distribution_in_one_step():
         scheduler.step()
     with torch.no_grad():
         x = one_step_sample(network, torch.randn(20_000, 1, 1), torch.zeros(20_000, 0))
-    assert x.mean() == pytest.approx(1.5, abs=0.1)
-    assert x.std() == pytest.approx(0.5, abs=0.12)
+    assert x.mean() == pytest.approx(MEAN, abs=0.1)
+    assert x.std() == pytest.approx(STD, abs=0.12)

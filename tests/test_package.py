@@ -4,6 +4,7 @@ import ast
 import importlib.metadata
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ ALLOWED = {
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
+    "commands": {"data"},
 }
 
 
@@ -55,6 +57,15 @@ def test_the_installed_name_keeps_its_underscores():
 def test_only_our_console_commands_are_installed():
     scripts = importlib.metadata.distribution(DISTRIBUTION).entry_points
     assert {script.name for script in scripts} == {"lerobot-uca-collect"}
+
+
+def test_a_wheel_holds_the_package_and_nothing_else(tmp_path):
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, check=True, capture_output=True, cwd=SOURCE.parent.parent)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
+    assert {name.split("/")[0] for name in names} == {"lerobot_uca", "lerobot_policy_uca_flow.py"}
+    assert len(names) == len(list(SOURCE.rglob("*.py"))) + 1
 
 
 def test_lerobot_discovers_everything_in_a_fresh_interpreter():

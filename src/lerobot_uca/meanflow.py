@@ -45,7 +45,8 @@ def sample_intervals(batch_size: int, device: torch.device | str, *, mean: float
 
     1. Two draws from a logit-normal distribution, sigmoid(N(mean, std^2)).
     2. t is the later one, r the earlier one.
-    3. Half of the batch gets r = t. Batches are shuffled, so the first half is as good as a random one.
+    3. Half of the batch gets r = t. Batches are shuffled, so the first half is as good as a random one. (LeRobot's
+       held-out loss is not shuffled, there it stays the first half; a batch of one sample has no instant.)
     """
     draws = torch.sigmoid(mean + std * torch.randn(2, batch_size, device=device))
     t, r = draws.amax(dim=0), draws.amin(dim=0)

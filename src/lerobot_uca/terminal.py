@@ -1,18 +1,27 @@
 """What LeRobot's commands show of this package in a terminal: one line for a user's mistake, no foreign noise."""
 
+import errno
+import functools
 import logging
+import os
 import sys
+from pathlib import Path
 from types import TracebackType
+
+from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_uca.errors import UserError
 
+# Files and folders that cannot be used. The message names them, and a traceback would add nothing.
+USERS_FILE_ERRORS = {errno.EACCES, errno.EPERM, errno.ENOTDIR, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG}
 
-def report_user_errors_in_one_line() -> None:
-    """Let an uncaught `UserError` end the process with its message alone, and all other errors as before."""
+
+def report_errors_in_one_line() -> None:
+    """Let what a user can mend end the process with its message alone, and all other errors as before."""
     previous = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if isinstance(error, UserError):
+        if isinstance(error, UserError) or (isinstance(error, OSError) and error.errno in USERS_FILE_ERRORS):
             print(f"error: {error}", file=sys.stderr)
         else:
             previous(kind, error, traceback)
@@ -28,3 +37,19 @@ def quiet_video_decoder() -> None:
     logging.getLogger("lerobot.utils.import_utils").addFilter(
         lambda record: "'torchcodec' is installed but cannot be loaded" not in record.getMessage()
     )
+
+
+def check_output_folder_before_training() -> None:
+    """Let `lerobot-train` refuse a folder it cannot write before it trains; it would fail at the first checkpoint."""
+    validate = TrainPipelineConfig.validate
+
+    @functools.wraps(validate)
+    def validate_and_check(self: TrainPipelineConfig) -> None:
+        validate(self)
+        parent = Path(self.output_dir).absolute()
+        while not os.path.lexists(parent):
+            parent = parent.parent
+        if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
+            raise UserError(f"output_dir '{self.output_dir}' cannot be written: '{parent}' is not a writable folder.")
+
+    TrainPipelineConfig.validate = validate_and_check

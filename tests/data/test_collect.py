@@ -1,9 +1,12 @@
+import dataclasses
 import gc
 import re
 import shutil
 
 import numpy as np
 import pytest
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env_config
 
@@ -111,11 +114,39 @@ def test_a_folder_that_cannot_be_written(tmp_path):
         collect(config(tmp_path / "file" / "drawer"))
 
 
-def test_seeds_of_demonstrations_and_evaluation_are_apart():
-    assert collecting.FIRST_SEED > 1000 + 100_000
+@pytest.mark.parametrize("pipeline", [EvalPipelineConfig, TrainPipelineConfig])
+def test_seeds_of_demonstrations_and_evaluation_are_apart(pipeline):
+    """LeRobot evaluates episode i with its default seed + i, also during training."""
+    first_evaluation = next(field.default for field in dataclasses.fields(pipeline) if field.name == "seed")
+    assert first_evaluation + 100_000 <= collecting.FIRST_SEED
+
+
+def test_groups_that_overlap_give_each_task_once(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(collecting, "_collect_task", lambda dataset, env, task, *_: asked.append(task))
+    env = MetaworldPointCloudConfig(task="hard,assembly,push,dial-turn", n_points=16)
+    collecting._write(config(tmp_path / "x", env=env), env, tmp_path / "data")
+    assert len(asked) == len(set(asked)) == 7
+
+
+def test_an_overwrite_that_cannot_finish_brings_the_old_folder_back(tmp_path, monkeypatch):
+    old, new = tmp_path / "data", tmp_path / "new"
+    old.mkdir()
+    with pytest.raises(FileNotFoundError):
+        collecting._replace(old, new, backup=tmp_path / "backup")  # there is no new folder
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_a_name_that_is_too_long(tmp_path):
+    with pytest.raises(UserError, match="Cannot write"):
+        collect(config(tmp_path / ("x" * 300)))
 
 
 def test_wrong_settings(tmp_path):
+    with pytest.raises(UserError, match=r"repo_id must be 'user/name', got 'a/b/c'"):
+        collect(config(tmp_path / "new", repo_id="a/b/c"))
+    with pytest.raises(UserError, match=r"env\.fps of metaworld_pointcloud is 80, the simulation's own; got 30"):
+        collect(config(tmp_path / "new", env=MetaworldPointCloudConfig(task="reach", fps=30)))
     with pytest.raises(UserError, match="n_episodes must be at least 1, got 0"):
         collect(config(tmp_path / "new", n_episodes=0))
     with pytest.raises(UserError, match=r"Only point-cloud environments have a demonstrator, got env\.type=pusht"):

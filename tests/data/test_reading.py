@@ -1,7 +1,12 @@
 """Batched reading gives what stock reading gives, bit for bit and key for key."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import torch
+from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tests.conftest import N_ACTIONS, write_dataset
 from torch.utils.data import DataLoader, Subset, default_collate
@@ -42,16 +47,72 @@ def test_every_sample_equals_stock_reading(dataset_root, episodes, windows):
     assert_equal_batches(default_collate(batched), default_collate(stock))
 
 
-@pytest.mark.parametrize("num_workers", [0, 2])
-def test_a_dataloader_reads_the_same(dataset_root, num_workers):
+def test_a_dataloader_reads_the_same(dataset_root):
     dataset = open_dataset(dataset_root, delta_timestamps=WINDOWS)
-    context = "spawn" if num_workers else None
-    loader = DataLoader(dataset, batch_size=5, num_workers=num_workers, multiprocessing_context=context)
     stock = [
         default_collate([dataset[i] for i in range(n, min(n + 5, len(dataset)))]) for n in range(0, len(dataset), 5)
     ]
-    for got, expected in zip(loader, stock, strict=True):
+    for got, expected in zip(DataLoader(dataset, batch_size=5), stock, strict=True):
         assert_equal_batches(got, expected)
+
+
+WORKERS = """
+import sys
+import torch
+from torch.utils.data import DataLoader, default_collate, get_worker_info
+
+def collate(samples):
+    # Runs in a worker. Nothing registers the plugin there: the dataset itself must bring batched reading along.
+    dataset = get_worker_info().dataset
+    columns = dataset.__dict__["_decoded_columns"]
+    batched = hasattr(type(dataset), "__getitems__") and columns is not None
+    shared = all(tensor.is_shared() for tensor in columns.tensors.values())
+    return default_collate(samples), batched, shared
+
+if __name__ == "__main__":
+    import lerobot_policy_uca_flow
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    root, context = sys.argv[1:]
+    windows = {"observation.point_cloud": [-1 / 80, 0], "action": [0, 1 / 80]}
+    dataset = LeRobotDataset("test/random", root=root, delta_timestamps=windows)
+    loader = DataLoader(dataset, batch_size=5, num_workers=2, multiprocessing_context=context, collate_fn=collate)
+    for n, (batch, batched, shared) in enumerate(loader):
+        assert batched
+        assert shared or context == "fork"  # a forked worker decodes for itself
+        stock = default_collate([dataset[i] for i in range(5 * n, min(5 * n + 5, len(dataset)))])
+        assert all(torch.equal(batch[key], stock[key]) for key in stock if key != "task")
+    print("read", n + 1)
+"""
+
+
+@pytest.mark.parametrize("context", ["spawn", "fork"])
+def test_workers_read_in_batches_too(dataset_root, tmp_path, context):
+    script = tmp_path / "workers.py"
+    script.write_text(WORKERS)
+    command = [sys.executable, str(script), str(dataset_root), context]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert "read 8" in result.stdout
+
+
+def test_a_held_out_split_and_resumed_order_read_the_same(dataset_root):
+    """As lerobot-train makes them: episodes of a split, and a sampler that starts in the middle of an epoch."""
+    for episodes in ([0, 1], [2]):
+        dataset = open_dataset(dataset_root, episodes=episodes, delta_timestamps=WINDOWS)
+        sampler = EpisodeAwareSampler(
+            dataset.meta.episodes["dataset_from_index"],
+            dataset.meta.episodes["dataset_to_index"],
+            episode_indices_to_use=dataset.episodes,
+            shuffle=True,
+            seed=0,
+            absolute_to_relative_idx=dataset.absolute_to_relative_idx,
+        )
+        sampler.load_state_dict(compute_sampler_state(2, len(sampler), 4, 1))
+        indices = list(sampler)
+        assert len(indices) == len(sampler) - 8
+        for got, index in zip(dataset.__getitems__(indices), indices, strict=True):
+            assert_equal_batches(got, dataset[index])
 
 
 def test_subsets_read_the_same(dataset_root):
@@ -60,12 +121,6 @@ def test_subsets_read_the_same(dataset_root):
     subset = Subset(dataset, [3, 1, 20])
     for got, index in zip(subset.__getitems__([0, 1, 2]), [3, 1, 20], strict=True):
         assert_equal_batches(got, dataset[index])
-
-
-def test_sent_to_workers_the_columns_are_shared_not_copied(dataset_root):
-    dataset = open_dataset(dataset_root)
-    columns = dataset.__getstate__()["_decoded_columns"]
-    assert all(tensor.is_shared() for tensor in columns.tensors.values())
 
 
 def test_rows_that_do_not_exist(dataset_root):
@@ -114,10 +169,20 @@ def test_other_number_types_keep_their_values(tmp_path):
         assert_equal_batches(dataset.__getitems__([index])[0], dataset[index])
 
 
-def test_switch(monkeypatch):
-    monkeypatch.setenv(reading.SWITCH, "0")
-    assert not reading.install()
-    monkeypatch.delenv(reading.SWITCH)
-    assert reading.install()
+@pytest.mark.parametrize("switch", ["0", "1"])
+def test_switch(switch):
+    code = (
+        "import lerobot_policy_uca_flow\n"
+        "from lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
+        "print(hasattr(LeRobotDataset, '__getitems__'))"
+    )
+    variables = {**os.environ, reading.SWITCH: switch}
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=variables)
+    assert result.stdout.strip() == str(switch == "1")
+
+
+def test_another_lerobot_is_left_alone(monkeypatch):
     monkeypatch.setattr(reading.lerobot, "__version__", "0.7.0")
-    assert not reading.install()
+    monkeypatch.delattr(LeRobotDataset, "__getitems__")
+    reading._install()
+    assert not hasattr(LeRobotDataset, "__getitems__")

@@ -17,9 +17,6 @@ from lerobot_uca.envs.metaworld import (
 from lerobot_uca.envs.point_cloud import Crop
 from lerobot_uca.errors import UserError
 
-# Which bodies are part of the furniture is known to the simulator; the crop itself goes by position only.
-FURNITURE = ("base", "tablelink", "RetainingWall", "right_", "controller_box", "pedestal", "torso", "head", "screen")
-
 
 @pytest.fixture(scope="module")
 def env():
@@ -186,6 +183,13 @@ def test_an_unknown_task_names_the_valid_ones_nearest_first():
 def test_no_task(task):
     with pytest.raises(UserError, match="No task given"):
         make_env_config("metaworld_pointcloud", task=task).get_env_processors()
+
+
+def test_an_environment_of_a_task_that_is_none():
+    with pytest.raises(UserError, match="Unknown task 'foo'"):
+        MetaworldPointCloudEnv("foo")
+    with pytest.raises(UserError, match="An environment has one task, got the group 'hard'"):
+        MetaworldPointCloudEnv("hard")
 
 
 def test_no_points():

@@ -5,18 +5,17 @@ Example:
 """
 
 import shutil
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
-from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineModeIsEnabled
+from huggingface_hub.utils import validate_repo_id as check_repo_id
 from lerobot.configs import parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import SuppressProgressBars
 from tqdm import tqdm
 
@@ -74,23 +73,20 @@ def collect(config: CollectConfig) -> LeRobotDataset:
         raise UserError(f"Only point-cloud environments have a demonstrator, got env.type={env_config.type}.")
     if config.n_episodes < 1:
         raise UserError(f"n_episodes must be at least 1, got {config.n_episodes}.")
-    env_config.validate()
-    root = config.root or HF_LEROBOT_HOME / config.repo_id
-    if root.exists() and not config.overwrite:
-        raise UserError(f"'{root}' exists. Choose another --root, or replace it with --overwrite.")
-    unfinished = root.with_name(f".{root.name}.unfinished")
     try:
+        check_repo_id(config.repo_id)
+    except HFValidationError as error:
+        raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
+    env_config.validate()
+    root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
+    unfinished, replaced = (root.with_name(f".{root.name}.{state}") for state in ("unfinished", "replaced"))
+    try:
+        if root.exists() and not config.overwrite:
+            raise UserError(f"'{root}' exists. Choose another --root, or replace it with --overwrite.")
         root.parent.mkdir(parents=True, exist_ok=True)
         _remove(unfinished)
         _write(config, env_config, unfinished)
-        if root.exists():
-            replaced = root.with_name(f".{root.name}.replaced")
-            _remove(replaced)
-            root.rename(replaced)
-            unfinished.rename(root)
-            _remove(replaced)
-        else:
-            unfinished.rename(root)
+        _replace(root, unfinished, backup=replaced)
     except OSError as error:
         raise UserError(f"Cannot write '{root}': {error}") from error
     finally:
@@ -100,9 +96,23 @@ def collect(config: CollectConfig) -> LeRobotDataset:
         try:
             dataset.push_to_hub(private=config.private, tags=["point-cloud", env_config.type])
         except (HfHubHTTPError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
-            reason = str(error).strip().splitlines()[0]
+            reason = " ".join(str(error).split())
             raise UserError(f"The dataset in '{root}' is complete but could not be uploaded: {reason}") from error
     return dataset
+
+
+def _replace(folder: Path, new: Path, *, backup: Path) -> None:
+    if not folder.exists():
+        new.rename(folder)
+        return
+    _remove(backup)
+    folder.rename(backup)
+    try:
+        new.rename(folder)
+    except OSError:
+        backup.rename(folder)
+        raise
+    _remove(backup)
 
 
 def _remove(folder: Path) -> None:
@@ -114,7 +124,8 @@ def _write(config: CollectConfig, env_config: PointCloudEnvConfig, root: Path) -
         config.repo_id, fps=env_config.fps, features=_features(env_config), root=root, use_videos=False
     )
     try:
-        for task in (task for tasks in env_config.tasks().values() for task in tasks):
+        # Groups may overlap; a task's episodes are wanted once.
+        for task in dict.fromkeys(task for tasks in env_config.tasks().values() for task in tasks):
             _collect_task(dataset, env_config, task, config.n_episodes, config.seed)
     finally:
         dataset.finalize()  # closes its files, which would otherwise come back when they are garbage-collected
@@ -156,18 +167,10 @@ def _features(env_config: PointCloudEnvConfig) -> dict[str, dict[str, Any]]:
 
 
 @parser.wrap()
-def _main(config: CollectConfig) -> None:
+def run(config: CollectConfig) -> None:
+    """Collect and say what was collected."""
     dataset = collect(config)
     print(
         f"{dataset.num_episodes} episodes, {dataset.num_frames} frames, seeds from {config.seed}: {dataset.root}\n"
         f"Evaluate on other seeds (lerobot-eval uses 1000 and up)."
     )
-
-
-def main() -> None:
-    """The console command."""
-    register_third_party_plugins()
-    # LeRobot's parser wants a value for every option; a bare flag is what people type.
-    flags = {f"--{name}": f"--{name}=true" for name in ("overwrite", "push_to_hub", "private")}
-    sys.argv[1:] = [flags.get(argument, argument) for argument in sys.argv[1:]]
-    _main()

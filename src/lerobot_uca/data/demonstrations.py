@@ -1,4 +1,4 @@
-"""Running experts, on all cores. Light to import: each worker process does it."""
+"""Running experts, on all cores. Light to import, without torch and LeRobot: each worker process does it."""
 
 import multiprocessing
 import os

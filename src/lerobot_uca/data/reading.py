@@ -1,10 +1,10 @@
 """Batched reading of LeRobot datasets without cameras, which stock LeRobot 0.6.1 decodes row by row.
 
 PyTorch's DataLoader asks a dataset for a whole batch where it has `__getitems__`. LeRobotDataset has none, so each
-sample costs a full-row decode for every delta query: 15 to 70 ms for two clouds of 512 points. `install` adds the
-method. It decodes all columns once into contiguous tensors and then gathers windows from them; the samples equal those
-of stock reading bit for bit. Datasets with images, videos or language columns, and datasets too large for memory, are
-read as before.
+sample costs a full-row decode for every delta query: 15 to 70 ms for two clouds of 512 points. Importing this module
+adds the method. It decodes all columns once into contiguous tensors and then gathers windows from them; the samples
+equal those of stock reading bit for bit. Datasets with images, videos or language columns, and datasets above 4 GiB,
+are read as before.
 
 Set LEROBOT_UCA_BATCHED_READING=0 to switch it off.
 """
@@ -23,8 +23,8 @@ from torch import Tensor
 
 SWITCH = "LEROBOT_UCA_BATCHED_READING"
 SUPPORTED_LEROBOT = "0.6.1"
-MAX_BYTES = 8 * 2**30
-"""Decoded columns above this size stay on disk, and reading stays stock."""
+MAX_BYTES = 4 * 2**30
+"""Datasets whose decoded columns would be larger are read as before."""
 
 Sample = dict[str, Tensor | str]
 
@@ -47,8 +47,6 @@ class Columns:
         self.episode_end = torch.tensor(episodes["dataset_to_index"])
         self.row_of_frame = torch.full((int(self.episode_end.max()),), -1)
         self.row_of_frame[self.tensors["index"]] = torch.arange(len(self.tensors["index"]))
-        for tensor in (*self.tensors.values(), self.episode_start, self.episode_end, self.row_of_frame):
-            tensor.share_memory_()  # a DataLoader's workers get handles, not copies
 
     def samples(self, reader: DatasetReader, rows: Sequence[int]) -> list[Sample]:
         """What `reader.get_item` gives for each row."""
@@ -117,16 +115,18 @@ def _getitems(self: LeRobotDataset, indices: Sequence[int]) -> list[Any]:
 
 
 def _getstate(self: LeRobotDataset) -> dict[str, Any]:
-    """Decode before the dataset is sent to a DataLoader's workers, so that they share one copy."""
+    """Decode before the dataset is sent to a DataLoader's workers: PyTorch lets them share the tensors' memory."""
     _columns(self)
     return self.__dict__.copy()
 
 
-def install() -> bool:
-    """Give LeRobotDataset batched reading. True if it has it, False if switched off or not made for this LeRobot."""
+def _install() -> None:
     if os.environ.get(SWITCH, "1") == "0" or lerobot.__version__ != SUPPORTED_LEROBOT:
-        return False
-    if "__getitems__" not in vars(LeRobotDataset):
+        return
+    if not hasattr(LeRobotDataset, "__getitems__"):
         LeRobotDataset.__getitems__ = _getitems
         LeRobotDataset.__getstate__ = _getstate
-    return LeRobotDataset.__getitems__ is _getitems
+
+
+# At import: a DataLoader's worker imports this module when it is sent `Columns`, and nothing else of the plugin.
+_install()

@@ -13,7 +13,6 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_uca.envs import metaworld
 from lerobot_uca.envs.expert import Expert
-from lerobot_uca.envs.task_names import resolve_tasks
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -70,6 +69,8 @@ class PointCloudEnvConfig(EnvConfig):
         """Raise a `UserError` for what cannot be made."""
         if self.n_points < 1:
             raise UserError(f"env.n_points must be at least 1, got {self.n_points}.")
+        if self.fps != type(self).fps:  # datasets would tell the wrong time
+            raise UserError(f"env.fps of {self.type} is {type(self).fps}, the simulation's own; got {self.fps}.")
         self.tasks()
 
     @override
@@ -108,10 +109,7 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
 
     @override
     def tasks(self) -> dict[str, tuple[str, ...]]:
-        names = ",".join(entry.strip().removesuffix("-v3") for entry in (self.task or "").split(","))
-        return resolve_tasks(
-            names, benchmark="Meta-World", tasks=metaworld.task_descriptions(), groups=metaworld.task_groups()
-        )
+        return metaworld.resolve(self.task)
 
     @override
     def env_factory(self, task: str) -> Callable[[], gym.Env]:

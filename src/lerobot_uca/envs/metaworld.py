@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_uca.envs.point_cloud import Camera, Crop, sample_farthest
 from lerobot_uca.envs.ray_casting import Marker, PictureCamera, PointCloudCamera
+from lerobot_uca.envs.task_names import resolve_tasks
 from lerobot_uca.errors import UserError
 
 # Meta-World's camera 'corner2' (euler 3.9 2.3 0.6), moved to where DP3, FlowPolicy and MP1 put it. Its axes are
@@ -75,6 +76,16 @@ def task_groups() -> dict[str, tuple[str, ...]]:
     return {**difficulties, "paper": PAPER_TASKS, "all": tuple(task_descriptions())}
 
 
+def resolve(spec: str | None) -> dict[str, tuple[str, ...]]:
+    """Tasks for each comma-separated entry, a task with or without '-v3' or a group: {entry: tasks}.
+
+    Raises:
+        UserError: for an empty or unknown entry.
+    """
+    entries = ",".join(entry.strip().removesuffix("-v3") for entry in (spec or "").split(","))
+    return resolve_tasks(entries, benchmark="Meta-World", tasks=task_descriptions(), groups=task_groups())
+
+
 class MetaworldPointCloudEnv(gym.Env[Any, Any]):
     """One Meta-World task, observed as the baselines observe it: a point cloud and the gripper's position.
 
@@ -88,7 +99,7 @@ class MetaworldPointCloudEnv(gym.Env[Any, Any]):
     that vector environments build it in their workers.
 
     Args:
-        task: a name from `task_descriptions()`.
+        task: a name from `task_descriptions()`, with or without '-v3'.
         n_points: points of the cloud.
     """
 
@@ -97,8 +108,10 @@ class MetaworldPointCloudEnv(gym.Env[Any, Any]):
     _max_episode_steps = EPISODE_LENGTH  # LeRobot reads it
 
     def __init__(self, task: str, n_points: int = 512) -> None:
-        self.task = task
-        self.task_description = task_descriptions()[task]
+        ((self.task, *others),) = resolve(task).values()
+        if others:
+            raise UserError(f"An environment has one task, got the group '{task}'.")
+        self.task_description = task_descriptions()[self.task]
         self.n_points = n_points
         self.observation_space = gym.spaces.Dict(
             {
@@ -110,7 +123,7 @@ class MetaworldPointCloudEnv(gym.Env[Any, Any]):
         self.expert_observation: Any = None
         """Meta-World's own observation (39,) after the last reset or step, goal included: for scripted experts."""
         self._simulator: Any = None
-        self.crop = HOLE_CROP if task in HOLE_TASKS else CROP
+        self.crop = HOLE_CROP if self.task in HOLE_TASKS else CROP
         self._cloud_camera = PointCloudCamera(CLOUD_CAMERA, self.crop)
         self._picture_camera: PictureCamera | None = None
         self._n_steps = 0

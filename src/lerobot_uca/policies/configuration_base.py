@@ -29,7 +29,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         n_points: how many points of a cloud the policy looks at, the first ones; None for all. Clouds of this
             package's environments are in farthest-point order, so the first ones are spread evenly.
         point_widths, n_point_features, n_state_features: sizes of the observation encoder (those of the baselines).
-        dtype: precision of training: 'float32' or 'bfloat16' (autocast; the weights stay float32).
+        dtype: precision of training: 'float32' or 'bfloat16' (autocast; the weights stay float32). LeRobot also
+            evaluates with it during training; `lerobot-eval` uses float32 unless told policy.use_amp=true.
         ema_power, ema_max_decay: the averaged weights follow with decay 1 - (1 + step)^-ema_power, at most
             ema_max_decay.
         optimizer_*, scheduler_*: AdamW and its warm-up, followed by a cosine to zero over the remaining steps. A norm

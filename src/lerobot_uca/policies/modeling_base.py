@@ -10,7 +10,8 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from textwrap import shorten
+from typing import Any, NamedTuple, NoReturn, Self
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -105,7 +106,7 @@ class PointCloudPolicy(PreTrainedPolicy):
         """
         if reduction not in ("mean", "none"):
             raise UserError(f"reduction must be 'mean' or 'none', got '{reduction}'.")
-        self._check_shapes(batch)
+        self._check_shapes(batch, self.config.n_obs_steps)
         x = batch[ACTION]
         expected = (self.config.horizon, self.config.n_actions)
         if x.shape[1:] != expected:
@@ -151,7 +152,7 @@ class PointCloudPolicy(PreTrainedPolicy):
         return self._planned.popleft()
 
     @torch.no_grad()
-    def predict_action_chunk(self, batch: Mapping[str, Tensor], noise: Tensor | None = None, **_: Any) -> Tensor:
+    def predict_action_chunk(self, batch: Mapping[str, Tensor], noise: Tensor | None = None) -> Tensor:
         """The actions to execute from now on, (B, n_action_steps, A), normalised.
 
         Args:
@@ -170,13 +171,14 @@ class PointCloudPolicy(PreTrainedPolicy):
         return self.model if self.training else self.ema_model
 
     def _remember(self, batch: Mapping[str, Tensor]) -> None:
+        self._check_shapes({key: _get(batch, key)[:, None] for key in OBSERVATION_KEYS}, n_obs=1)
         populate_queues(self._history, {key: _get(batch, key) for key in OBSERVATION_KEYS})
 
     def _remembered(self) -> dict[str, Tensor]:
         return {key: torch.stack(list(frames), dim=1) for key, frames in self._history.items()}
 
     def _plan(self, history: Mapping[str, Tensor], noise: Tensor | None) -> Tensor:
-        self._check_shapes(history)
+        self._check_shapes(history, self.config.n_obs_steps)
         state = history[OBS_STATE]
         if noise is None:
             noise = torch.randn(len(state), self.config.horizon, self.config.n_actions, device=state.device)
@@ -193,9 +195,9 @@ class PointCloudPolicy(PreTrainedPolicy):
 
     # Bad input --------------------------------------------------------------------------------------------------
 
-    def _check_shapes(self, batch: Mapping[str, Tensor]) -> None:
+    def _check_shapes(self, batch: Mapping[str, Tensor], n_obs: int) -> None:
         cloud, state = _get(batch, OBS_POINT_CLOUD), _get(batch, OBS_STATE)
-        n_obs, n_points = self.config.n_obs_steps, self.config.n_points or 1
+        n_points = self.config.n_points or 1
         if cloud.ndim != 4 or cloud.shape[1] != n_obs or cloud.shape[2] < n_points or cloud.shape[3] != 3:
             raise UserError(
                 f"'{OBS_POINT_CLOUD}' must have shape (B, {n_obs}, N, 3) with N at least {n_points}, "
@@ -205,7 +207,8 @@ class PointCloudPolicy(PreTrainedPolicy):
         if tuple(state.shape) != expected:
             raise UserError(f"'{OBS_STATE}' must have shape {expected}, got {tuple(state.shape)}.")
 
-    def _explain_non_finite(self, batch: Mapping[str, Tensor], keys: Iterable[str]) -> None:
+    def _explain_non_finite(self, batch: Mapping[str, Tensor], keys: Iterable[str]) -> NoReturn:
+        self.reset()  # the history holds what is wrong
         for key in keys:
             n_bad = int((~torch.isfinite(batch[key])).sum())
             if n_bad:
@@ -231,8 +234,10 @@ class PointCloudPolicy(PreTrainedPolicy):
             return super()._load_as_safetensor(model, model_file, map_location, strict=True)
         except (SafetensorError, RuntimeError) as error:
             reason = " ".join(str(error).split())
+            if isinstance(error, RuntimeError) and "state_dict" not in reason:
+                raise
             raise UserError(
-                f"'{model_file}' does not hold the weights of this '{cls.name}' policy: {reason}"
+                f"'{model_file}' does not hold the weights of this '{cls.name}' policy: {shorten(reason, 300)}"
             ) from error
 
 

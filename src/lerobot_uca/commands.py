@@ -1,0 +1,20 @@
+"""The console commands. Imports are put off, because each process of `lerobot-uca-collect` loads this module again."""
+
+import sys
+
+
+def collect() -> None:
+    """`lerobot-uca-collect`."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_uca.data.collect import run
+
+    register_third_party_plugins()
+    # LeRobot's parser wants a value for every option; a bare flag is what people type.
+    bare = {"--overwrite", "--push_to_hub", "--private"}
+    followed_by_value = [*(not argument.startswith("-") for argument in sys.argv[2:]), False]
+    sys.argv[1:] = [
+        f"{argument}=true" if argument in bare and not has_value else argument
+        for argument, has_value in zip(sys.argv[1:], followed_by_value, strict=False)
+    ]
+    run()
