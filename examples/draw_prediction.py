@@ -92,6 +92,7 @@ def draw_cloud(
         axes.plot(*path.T, color="crimson", linewidth=1)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.set_aspect("equal")
+    axes.locator_params(nbins=4)
     axes.view_init(elev=30, azim=-40)
 
 

@@ -1,0 +1,113 @@
+"""Seconds of a training step by stage, and how far it is from the machine's floor.
+
+python benchmarks/training_step.py                               # the small configuration
+python benchmarks/training_step.py --dim=256 --n_points=512      # the default one
+
+The floor is the step's floating-point operations, counted by PyTorch, over the measured peak of a matrix product in the
+same precision. For comparison: Simple DP3's public code takes 1.03 s a step at the same batch on two such cores.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from torch.utils.flop_counter import FlopCounterMode
+
+import lerobot_policy_uca_flow  # noqa: F401  (registers the policy)
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+
+N_STATES, N_ACTIONS, CLOUD_POINTS = 9, 4, 512
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dim", type=int, default=128)
+    parser.add_argument("--n_points", type=int, default=128)
+    parser.add_argument("--batch_size", type=int, default=128)
+    parser.add_argument("--dtype", choices=["bfloat16", "float32"], default="bfloat16")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--steps", type=int, default=20)
+    args = parser.parse_args()
+
+    policy, batch = make(args.dim, args.n_points, args.batch_size, args.dtype, args.device)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-4)
+    dtype = getattr(torch, args.dtype)
+
+    def forward() -> torch.Tensor:
+        with torch.autocast(args.device, dtype=dtype, enabled=dtype is not torch.float32):
+            return policy.forward(batch)[0]
+
+    with FlopCounterMode(display=False) as counter:
+        forward().backward()
+    flops = counter.get_total_flops()
+    rows = []
+    for _ in range(args.steps + 2):
+        optimizer.zero_grad()
+        encode, _ = timed(lambda: encode_only(policy, batch, dtype), args.device)
+        whole, loss = timed(forward, args.device)
+        backward, _ = timed(loss.backward, args.device)
+        step, _ = timed(lambda: (optimizer.step(), policy.update()), args.device)
+        rows.append([encode, whole - encode, backward, step, whole + backward + step])
+    stages = np.median(rows[2:], axis=0)
+    peak = matrix_product_peak(dtype, args.device)
+    floor = flops / peak
+    print(f"batch {args.batch_size}, dim {args.dim}, {args.n_points} points, {args.dtype} on {args.device}, ", end="")
+    print(f"{torch.get_num_threads()} threads; median of {args.steps} steps")
+    names = ("encoder, forward", "two passes and JVP, forward", "backward", "optimiser and moving average", "step")
+    for name, seconds in zip(names, stages, strict=True):
+        print(f"{name:32}{1e3 * seconds:9.1f} ms")
+    print(f"{'floor':32}{1e3 * floor:9.1f} ms   {flops / 1e9:.1f} GFLOP at {peak / 1e9:.0f} GFLOP/s")
+    print(f"{'step / floor':32}{stages[-1] / floor:9.1f}")
+
+
+def make(
+    dim: int, n_points: int, batch_size: int, dtype: str, device: str
+) -> tuple[UCAFlowPolicy, dict[str, torch.Tensor]]:
+    """A policy in training mode and a batch for it."""
+    features = {
+        OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (CLOUD_POINTS, 3)),
+        "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
+    }
+    action = {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))}
+    config = UCAFlowConfig(
+        device=device, input_features=features, output_features=action, dim=dim, n_points=n_points, dtype=dtype
+    )
+    policy = UCAFlowPolicy(config).to(device).train()
+    batch = {
+        OBS_POINT_CLOUD: torch.rand(batch_size, config.n_obs_steps, CLOUD_POINTS, 3, device=device),
+        "observation.state": torch.rand(batch_size, config.n_obs_steps, N_STATES, device=device),
+        "action": torch.rand(batch_size, config.horizon, N_ACTIONS, device=device),
+    }
+    return policy, batch
+
+
+def encode_only(policy: UCAFlowPolicy, batch: dict[str, torch.Tensor], dtype: torch.dtype) -> torch.Tensor:
+    """The observation features, in the precision of the step."""
+    with torch.autocast(str(batch["action"].device.type), dtype=dtype, enabled=dtype is not torch.float32):
+        return policy._encode(policy.model, batch)
+
+
+def matrix_product_peak(dtype: torch.dtype, device: str, size: int = 2048) -> float:
+    """The best rate of a square matrix product [FLOP/s]."""
+    a, b = torch.randn(2, size, size, dtype=dtype, device=device)
+    return 2 * size**3 / min(timed(lambda: a @ b, device)[0] for _ in range(10))
+
+
+def timed(function: Callable[[], Any], device: str) -> tuple[float, Any]:
+    """Seconds a call takes, the device's work included, and its result."""
+    start = time.perf_counter()
+    result = function()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start, result
+
+
+if __name__ == "__main__":
+    main()
