@@ -11,7 +11,7 @@ from typing import Any
 
 import httpx
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineModeIsEnabled
-from huggingface_hub.utils import validate_repo_id as check_repo_id
+from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
@@ -74,7 +74,7 @@ def collect(config: CollectConfig) -> LeRobotDataset:
     if config.n_episodes < 1:
         raise UserError(f"n_episodes must be at least 1, got {config.n_episodes}.")
     try:
-        check_repo_id(config.repo_id)
+        validate_repo_id(config.repo_id)
     except HFValidationError as error:
         raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
     env_config.validate()

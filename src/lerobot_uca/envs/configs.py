@@ -1,5 +1,6 @@
 """LeRobot's configurations of the environments: what `--env.type=...` finds."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -36,29 +37,29 @@ class PointCloudEnvConfig(EnvConfig):
         }
         self.features_map = {ACTION: ACTION, "point_cloud": OBS_POINT_CLOUD, "agent_pos": OBS_STATE}
 
+    @abstractmethod
     def tasks(self) -> dict[str, tuple[str, ...]]:
         """The tasks by suite: each entry of `task` is one."""
-        raise NotImplementedError
 
+    @abstractmethod
     def env_factory(self, task: str) -> Callable[[], gym.Env]:
         """Makes one environment of one task; light to send to another process."""
-        raise NotImplementedError
 
+    @abstractmethod
     def expert_factory(self, task: str) -> Callable[[], Expert]:
         """Makes the demonstrator of one task; light to send to another process."""
-        raise NotImplementedError
 
+    @abstractmethod
     def task_description(self, task: str) -> str:
         """What a task asks for, in English."""
-        raise NotImplementedError
 
+    @abstractmethod
     def action_names(self) -> list[str]:
         """What each number of an action means."""
-        raise NotImplementedError
 
+    @abstractmethod
     def state_names(self) -> list[str]:
         """What each number of `agent_pos` means."""
-        raise NotImplementedError
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
