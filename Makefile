@@ -25,6 +25,7 @@ format: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	python=$$(.ci/python) && "$$python" -m venv $(VENV)
+	@echo "Installing into $(VENV): several minutes and 6 GB, most of them PyTorch's"
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@

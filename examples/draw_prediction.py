@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import lerobot_policy_uca_flow  # noqa: F401  (registers policy and environment)
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
+from lerobot_uca.envs.point_cloud import Crop
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
@@ -59,11 +60,13 @@ def main() -> None:
             axes.axis("off")
             below = figure.add_subplot(2, N_MOMENTS, N_MOMENTS + moment + 1, projection="3d")
             assert isinstance(below, Axes3D)
-            draw_cloud(
-                below, observation["point_cloud"][: policy.config.n_points], observation["agent_pos"][:3], actions
-            )
+            cloud = observation["point_cloud"][: policy.config.n_points]
+            draw_cloud(below, env.crop, cloud, observation["agent_pos"][:3], actions)
         observation, *_ = env.step(postprocess(policy.select_action(batch))[0].numpy())
-    figure.suptitle(f"UCA-Flow: {N_SAMPLES} one-step predictions of the hand's motion (red, drawn {STRETCH} x as long)")
+    figure.suptitle(
+        f"Above, the scene. Below, the policy's cloud (coloured by height), the hand (black) and {N_SAMPLES} one-step "
+        f"predictions of its motion (red, drawn {STRETCH} x as long)"
+    )
     figure.tight_layout()
     args.output.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(args.output, dpi=80)
@@ -83,14 +86,16 @@ def sample_actions(
 
 
 def draw_cloud(
-    axes: Axes3D, cloud: NDArray[np.float32], hand: NDArray[np.float32], actions: NDArray[np.float32]
+    axes: Axes3D, crop: Crop, cloud: NDArray[np.float32], hand: NDArray[np.float32], actions: NDArray[np.float32]
 ) -> None:
-    """The cloud, coloured by height, and the hand's predicted paths."""
+    """The cloud, coloured by height, the hand, and its predicted paths."""
     axes.scatter(*cloud.T, c=cloud[:, 2], s=8, cmap="viridis")
+    axes.scatter(*hand, color="black", s=40)
     for sample in actions:
         path = hand + STRETCH * METRES_PER_ACTION * np.vstack([np.zeros(3), sample[:, :3].cumsum(axis=0)])
         axes.plot(*path.T, color="crimson", linewidth=1)
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    limits = zip(("xlim", "ylim", "zlim"), zip(crop.low, crop.high, strict=True), strict=True)
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", **dict(limits))
     axes.set_aspect("equal")
     axes.locator_params(nbins=4)
     axes.view_init(elev=30, azim=-40)

@@ -22,9 +22,10 @@ ENVIRONMENT = f"--env.type=metaworld_pointcloud --env.task={TASK}"
 
 
 class Step(NamedTuple):
-    """A command, what it writes, and the file that is there when it is complete."""
+    """A command, how long it takes on two cores, what it writes, and the file that is there when it is complete."""
 
     command: str
+    takes: str
     output: Path
     complete: Path
 
@@ -32,23 +33,27 @@ class Step(NamedTuple):
 STEPS = (
     Step(
         f"lerobot-uca-collect {ENVIRONMENT} --repo_id=local/{TASK} --root={DATASET}",
+        "about 30 seconds",
         DATASET,
         DATASET / "meta" / "info.json",
     ),
     Step(
         f"lerobot-train --config_path=configs/uca_flow_small.yaml --dataset.repo_id=local/{TASK} "
         f"--dataset.root={DATASET} --output_dir={TRAINING}",
+        "about 4 minutes",
         TRAINING,
         CHECKPOINT / "model.safetensors",
     ),
     Step(
         f"lerobot-eval --policy.path={CHECKPOINT} {ENVIRONMENT} --eval.n_episodes={N_EPISODES} --eval.batch_size=2 "
         f"--output_dir={EVALUATION}",
+        "about 2 minutes",
         EVALUATION,
         EVALUATION / "eval_info.json",
     ),
     Step(
         f"python examples/draw_prediction.py --checkpoint={CHECKPOINT} --task={TASK} --output={PICTURE}",
+        "about 10 seconds",
         PICTURE,
         PICTURE,
     ),
@@ -59,10 +64,11 @@ def main() -> None:
     """Run the steps that are not complete, then report."""
     print(f"UCA-Flow quickstart: Meta-World's {TASK}. To repeat a command: source .venv/bin/activate")
     for index, step in enumerate(STEPS):
-        print(f"\n$ {step.command}", flush=True)
+        print(f"\n$ {step.command}")
         if step.complete.exists():
             print(f"  (complete: {step.complete})")
             continue
+        print(f"  ({step.takes})", flush=True)
         for outdated in STEPS[index:]:  # what is left of a killed run, and what was made from older results
             remove(outdated.output)
         run(step.command)
@@ -84,7 +90,7 @@ def run(command: str) -> None:
     result = subprocess.run([Path(sys.executable).with_name(program), *arguments], check=False)
     if result.returncode:
         sys.exit(f"error: the command above ended with exit code {result.returncode}")
-    print(f"  ({time.monotonic() - start:.0f} s)")
+    print(f"  (took {time.monotonic() - start:.0f} s)")
 
 
 def report() -> None:

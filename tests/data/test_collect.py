@@ -12,7 +12,7 @@ from lerobot.envs import make_env_config
 
 from lerobot_uca.data import collect as collecting
 from lerobot_uca.data.collect import CollectConfig, collect
-from lerobot_uca.data.demonstrations import Demonstration, demonstrate
+from lerobot_uca.data.demonstrations import MIN_SUCCESSFUL_STEPS, Demonstration, demonstrate
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
@@ -39,7 +39,7 @@ def test_a_dataset_holds_whole_episodes_as_executed(collected):
     np.testing.assert_array_equal(np.stack([frame["observation.state"] for frame in frames]), episode.state)
     np.testing.assert_array_equal(np.stack([frame["action"] for frame in frames]), episode.action)
     assert np.abs(episode.action).max() == 1  # the expert asks for more; what is written is what was done
-    assert episode.success.sum() >= collecting.MIN_SUCCESSFUL_STEPS
+    assert episode.success.sum() >= MIN_SUCCESSFUL_STEPS
     assert frames[0]["task"] == env.task_description("drawer-close")
 
 
@@ -102,7 +102,7 @@ def test_an_overwrite_that_dies_keeps_the_old_dataset(collected, tmp_path):
 
 def test_an_expert_that_fails_is_reported(tmp_path, monkeypatch):
     failed = Demonstration(*(np.zeros((3, 1)) for _ in range(3)), success=np.zeros(3, dtype=bool))
-    monkeypatch.setattr(collecting, "demonstrations", lambda *_: iter([failed] * 1000))
+    monkeypatch.setattr(collecting, "demonstrations", lambda *_, **__: iter([failed] * 1000))
     with pytest.raises(UserError, match="The expert of 'drawer-close' succeeded in 0 of 20 episodes, 1 are wanted"):
         collect(config(tmp_path / "drawer"))
     assert list(tmp_path.iterdir()) == []

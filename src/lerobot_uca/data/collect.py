@@ -27,36 +27,35 @@ from lerobot_uca.features import OBS_POINT_CLOUD
 FIRST_SEED = 1_000_000
 """Where the seeds of demonstrations start. LeRobot evaluates from seed 1000 upwards unless told otherwise."""
 
-MIN_SUCCESSFUL_STEPS = 5
-"""A demonstration is kept if so many of its steps are successful (the baselines' rule for Meta-World)."""
-
 MAX_ATTEMPTS = 20
 """Attempts for each wanted episode before the collector gives up."""
 
 
 @dataclass
 class CollectConfig:
-    """What to collect and where to put it.
+    """Make demonstrations of a simulated task with its scripted expert, as a LeRobot dataset.
 
-    Args:
-        env: the environment and its task or tasks; with several, the dataset holds n_episodes of each.
-        repo_id: name of the dataset, 'user/name'.
-        root: folder to write; by default where LeRobot looks for it, $HF_LEROBOT_HOME/repo_id.
-        n_episodes: successful demonstrations of each task.
-        seed: seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of evaluation
-            (LeRobot's start at 1000), or the policy is tested on what it has seen.
-        overwrite: replace the folder if it exists.
-        push_to_hub: upload the dataset to the Hugging Face Hub under repo_id.
-        private: upload as a private dataset; by default as the account's settings say.
+    lerobot-uca-collect --env.type=metaworld_pointcloud --env.task=dial-turn --repo_id=local/dial-turn --root=data
+
+    Add --env.type=... to --help to see the environment's options. With several tasks, the dataset holds all of them.
     """
 
+    # The environment and its task or tasks.
     env: EnvConfig
+    # Name of the dataset, 'user/name'.
     repo_id: str
+    # Folder to write; by default where LeRobot looks for it, $HF_LEROBOT_HOME/repo_id.
     root: Path | None = None
+    # Successful demonstrations of each task.
     n_episodes: int = 10
+    # Seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of
+    # evaluation (LeRobot's start at 1000), or the policy is tested on what it has seen.
     seed: int = FIRST_SEED
+    # Replace the folder if it exists.
     overwrite: bool = False
+    # Upload the dataset to the Hugging Face Hub under repo_id.
     push_to_hub: bool = False
+    # Upload as a private dataset; by default as the account's settings say.
     private: bool | None = None
 
 
@@ -135,25 +134,23 @@ def _collect_task(
     dataset: LeRobotDataset, env_config: PointCloudEnvConfig, task: str, n_episodes: int, first_seed: int
 ) -> None:
     description = env_config.task_description(task)
-    episodes = demonstrations(env_config.env_factory(task), env_config.expert_factory(task), first_seed)
-    n_kept = 0
+    episodes = demonstrations(
+        env_config.env_factory(task), env_config.expert_factory(task), first_seed=first_seed, n_wanted=n_episodes
+    )
     with tqdm(total=n_episodes, desc=f"Demonstrations of {task}", unit="episode") as progress:
         for n_tried, episode in enumerate(episodes, start=1):
-            if episode.success.sum() >= MIN_SUCCESSFUL_STEPS:
+            if episode.is_successful:
                 for point_cloud, state, action, _ in zip(*episode, strict=True):
                     dataset.add_frame(
                         {OBS_POINT_CLOUD: point_cloud, OBS_STATE: state, ACTION: action, "task": description}
                     )
                 with SuppressProgressBars():
                     dataset.save_episode()
-                n_kept += 1
                 progress.update()
             progress.set_postfix(tried=n_tried)
-            if n_kept == n_episodes:
-                return
-            if n_tried >= MAX_ATTEMPTS * n_episodes:
+            if n_tried >= MAX_ATTEMPTS * n_episodes and progress.n < n_episodes:
                 raise UserError(
-                    f"The expert of '{task}' succeeded in {n_kept} of {n_tried} episodes, {n_episodes} are wanted."
+                    f"The expert of '{task}' succeeded in {progress.n} of {n_tried} episodes, {n_episodes} are wanted."
                 )
 
 

@@ -20,13 +20,9 @@ from lerobot_uca.features import OBS_POINT_CLOUD
 
 @dataclass
 class PointCloudEnvConfig(EnvConfig):
-    """What all point-cloud environments share: features, task names and vector environments.
+    """What all point-cloud environments share: features, task names and vector environments."""
 
-    Args:
-        task: one task, several separated by commas, or groups of tasks.
-        n_points: points of each cloud.
-    """
-
+    # Points of each cloud.
     n_points: int = 512
 
     def __post_init__(self) -> None:
@@ -105,7 +101,9 @@ def _vectorize(make: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -
 class MetaworldPointCloudConfig(PointCloudEnvConfig):
     """Meta-World's v3 tasks, by name with or without '-v3', or easy, medium, hard, very_hard, paper, all."""
 
+    # One task, several separated by commas, or a group.
     task: str | None = "drawer-close"
+    # The simulation's own rate; it cannot be changed.
     fps: int = metaworld.FPS
 
     @override

@@ -21,46 +21,48 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         | observed    | yes | yes |     |     |   n_obs_steps = 2
         | predicted   | yes | yes | yes | yes |   horizon = 4
         | executed    |     | yes | yes | yes |   n_action_steps = 3, entries [1:4] of the prediction
-
-    Args:
-        n_obs_steps: observation steps O, the current one included.
-        horizon: predicted actions T, from the first observation step on.
-        n_action_steps: actions executed before the next prediction, from the current step on.
-        n_points: how many points of a cloud the policy looks at, the first ones; None for all. Clouds of this
-            package's environments are in farthest-point order, so the first ones are spread evenly.
-        point_widths, n_point_features, n_state_features: sizes of the observation encoder (those of the baselines).
-        dtype: precision of training: 'float32' or 'bfloat16' (autocast; the weights stay float32). LeRobot also
-            evaluates with it during training; `lerobot-eval` uses float32 unless told policy.use_amp=true.
-        ema_power, ema_max_decay: the averaged weights follow with decay 1 - (1 + step)^-ema_power, at most
-            ema_max_decay.
-        optimizer_*, scheduler_*: AdamW and its warm-up, followed by a cosine to zero over the remaining steps. A norm
-            of 0 switches gradient clipping off.
     """
 
+    # Observation steps O, the current one included.
     n_obs_steps: int = 2
+    # Predicted actions T, from the first observation step on.
     horizon: int = 4
+    # Actions executed before the next prediction, from the current step on.
     n_action_steps: int = 3
+    # How many points of a cloud the policy looks at, the first ones; null for all. Clouds of this package's
+    # environments are in farthest-point order, so the first ones are spread evenly.
     n_points: int | None = None
 
+    # LeRobot takes the point cloud for a state: it is normalised by channel.
     normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "STATE": NormalizationMode.MIN_MAX,  # of the point cloud too: LeRobot takes it for a state
-            "ACTION": NormalizationMode.MIN_MAX,
-        }
+        default_factory=lambda: {"STATE": NormalizationMode.MIN_MAX, "ACTION": NormalizationMode.MIN_MAX}
     )
 
+    # Widths of the point encoder's layers (the baselines').
     point_widths: tuple[int, ...] = (64, 128, 256)
+    # Features of a cloud (the baselines').
     n_point_features: int = 64
+    # Features of a robot state (the baselines').
     n_state_features: int = 64
 
+    # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). LeRobot also evaluates with it
+    # during training; lerobot-eval uses float32 unless told policy.use_amp=true.
     dtype: str = "float32"
+    # The averaged weights follow with decay 1 - (1 + step)^-ema_power ...
     ema_power: float = 0.75
+    # ... but at most this one.
     ema_max_decay: float = 0.9999
+    # AdamW's learning rate, after the warm-up and before the cosine.
     optimizer_lr: float = 1e-4
+    # AdamW's betas.
     optimizer_betas: tuple[float, float] = (0.95, 0.999)
+    # AdamW's epsilon.
     optimizer_eps: float = 1e-8
+    # AdamW's weight decay.
     optimizer_weight_decay: float = 1e-6
+    # Gradients are scaled down to this norm; 0 switches it off.
     optimizer_grad_clip_norm: float = 1.0
+    # Steps of linear warm-up, followed by a cosine to zero over the remaining steps.
     scheduler_warmup_steps: int = 500
 
     def validate_sizes(self) -> None:

@@ -15,28 +15,30 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     """Configuration of `UCAFlowPolicy`. See `PointCloudPolicyConfig` for horizons, encoder and training recipe.
 
     The paper states none of the following values but dual_pass; each says where it comes from.
-
-    Args:
-        dim, n_layers, n_heads: width D of the tokens, transformer blocks, attention heads. 3.5 million parameters, half
-            of Simple DP3's; a quarter of them, dim = 128, already solves Meta-World's easy tasks (README).
-        n_timestep_tokens, n_interval_tokens: N_t and N_h; as many as there are action tokens, not tuned.
-        dual_pass: supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
-        gamma, c: of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with these values it is MP1's.
-        interval_mean, interval_std: t and r are two draws from sigmoid(N(mean, std^2)); MP1's values. They rarely draw
-            the whole interval [0, 1], which is what one step needs: a wider distribution learns faster in a short
-            training (README; configs/uca_flow_small.yaml).
     """
 
+    # Width D of the tokens. With 256 there are 3.5 million parameters, half of Simple DP3's; 128, with a quarter of
+    # them, already solves Meta-World's easy tasks (README).
     dim: int = 256
+    # Transformer blocks.
     n_layers: int = 4
+    # Attention heads.
     n_heads: int = 4
+    # Timestep tokens N_t; as many as there are action tokens, not tuned.
     n_timestep_tokens: int = 4
+    # Interval tokens N_h; likewise.
     n_interval_tokens: int = 4
 
+    # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
     dual_pass: bool = True
+    # Of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with 0.5 and 0.001 it is MP1's.
     gamma: float = 0.5
+    # See gamma.
     c: float = 1e-3
+    # t and r are two draws from sigmoid(N(interval_mean, interval_std^2)); MP1's values. They rarely draw the whole
+    # interval [0, 1], which is what one step needs: a wider distribution learns faster in a short training (README).
     interval_mean: float = -0.4
+    # See interval_mean.
     interval_std: float = 1.0
 
     @override
