@@ -46,6 +46,8 @@ def check_output_folder_before_training() -> None:
     @functools.wraps(validate)
     def validate_and_check(self: TrainPipelineConfig) -> None:
         validate(self)
+        if self.job.is_remote:  # the folder is on another machine
+            return
         parent = Path(self.output_dir).absolute()
         while not os.path.lexists(parent):
             parent = parent.parent

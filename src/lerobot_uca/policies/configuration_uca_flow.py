@@ -17,8 +17,8 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     The paper states none of the following values but dual_pass; each says where it comes from.
     """
 
-    # Width D of the tokens. With 256 there are 3.5 million parameters, half of Simple DP3's; 128, with a quarter of
-    # them, already solves Meta-World's easy tasks (README).
+    # Width D of the tokens. With 256 there are 3.5 million parameters, half of Simple DP3's; 128 gives
+    # a quarter of them and is what the README's results were measured with.
     dim: int = 256
     # Transformer blocks.
     n_layers: int = 4
@@ -36,7 +36,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # See gamma.
     c: float = 1e-3
     # t and r are two draws from sigmoid(N(interval_mean, interval_std^2)); MP1's values. They rarely draw the whole
-    # interval [0, 1], which is what one step needs: a wider distribution learns faster in a short training (README).
+    # interval [0, 1], which is what one step needs: a wider distribution got further in short trainings (README).
     interval_mean: float = -0.4
     # See interval_mean.
     interval_std: float = 1.0
