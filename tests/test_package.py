@@ -18,6 +18,7 @@ ALLOWED = {
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
+    "training": {"data", "policies", "errors"},
     "commands": {"data"},
 }
 
