@@ -190,7 +190,8 @@ class AdroitPointCloudEnv(PointCloudEnv):
         state = (options or {}).get("initial_state_dict")
         if state is not None:
             if not simulator._state_space.contains(state):
-                raise UserError(f"Adroit {self.task}: an initial state has {_state_fields(simulator)}, got {state}.")
+                fields, got = (_fields(arrays) for arrays in (simulator._state_space.sample(), state))
+                raise UserError(f"Adroit {self.task}: an initial state has {fields}, got {got}.")
             self.expert_observation, _ = simulator.reset(seed=seed, options={"initial_state_dict": state})
         self._n_steps = 0
         return self._observe(), {"is_success": False}
@@ -231,8 +232,8 @@ class AdroitPointCloudEnv(PointCloudEnv):
         return [Marker(site.xpos, 0.02, np.array([0.0, 1.0, 0.0]))]
 
 
-def _state_fields(simulator: Any) -> str:
-    return ", ".join(f"{name} ({space.shape[0]})" for name, space in simulator._state_space.items())
+def _fields(state: dict[str, Array]) -> str:
+    return ", ".join(f"{name} ({np.size(state[name])})" for name in sorted(state))
 
 
 def make_simulator(task: str) -> Any:

@@ -13,7 +13,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_uca.envs import adroit, adroit_expert, metaworld
+from lerobot_uca.envs import adroit, adroit_experts, metaworld
 from lerobot_uca.envs.expert import Attempt, attempts_by_seed
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
@@ -173,7 +173,7 @@ class AdroitPointCloudConfig(PointCloudEnvConfig):
 
     @override
     def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
-        return adroit_expert.attempts(task, expert, first_seed)
+        return adroit_experts.attempts(task, expert, first_seed)
 
     @override
     def task_description(self, task: str) -> str:
