@@ -18,6 +18,23 @@ from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 N_POINTS, N_STATES, N_ACTIONS = 32, 9, 4
+ADROIT_EXPERTS = Path(__file__).parents[2] / "shared" / "adroit_experts"
+"""Weights are data, not code: they lie beside the project."""
+
+
+@pytest.fixture(scope="session")
+def adroit_experts() -> Path:
+    """Folder of the trained policies, {task}.npz."""
+    if not ADROIT_EXPERTS.is_dir():
+        pytest.skip(f"there are no Adroit experts in {ADROIT_EXPERTS}")
+    return ADROIT_EXPERTS
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Skipped tests are easily overlooked."""
+    if not ADROIT_EXPERTS.is_dir():
+        line = f"NOT TESTED: Adroit's demonstrations, because there are no expert weights in {ADROIT_EXPERTS}"
+        terminalreporter.write_line(line, red=True, bold=True)
 
 
 @pytest.fixture(autouse=True)

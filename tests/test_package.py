@@ -77,7 +77,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 assert "uca_flow" in PreTrainedConfig.get_known_choices()
-assert "metaworld_pointcloud" in EnvConfig.get_known_choices()
+assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
 assert hasattr(LeRobotDataset, "__getitems__")
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
