@@ -1,6 +1,6 @@
 """The module LeRobot imports by the distribution's name: it makes LeRobot know this package and does nothing else.
 
-It registers policy and environment, gives datasets batched reading, and keeps the terminal readable.
+It registers policies and environments, gives datasets batched reading, and keeps the terminal readable.
 """
 
 import importlib
@@ -13,7 +13,13 @@ quiet_video_decoder()
 check_output_folder_before_training()
 
 # A missing optional dependency of one part must never take another part down.
-for part in ("policies.configuration_uca_flow", "envs.configs", "data.reading"):
+for part in (
+    "policies.configuration_uca_flow",
+    "policies.configuration_dp3",
+    "policies.configuration_simple_dp3",
+    "envs.configs",
+    "data.reading",
+):
     try:
         importlib.import_module(f"lerobot_uca.{part}")
     except ImportError as error:
