@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 VelocityNetwork = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 """u(z, t, h, o): z (B, T, A), t (B,), h (B,), o (B, ...) to (B, T, A)."""
@@ -73,15 +74,18 @@ def dual_pass(
 ) -> Velocities:
     """The network's two velocity views of z (paper section 3.4).
 
-    The first pass, h = 0, gives v. The second pass gives u and, in the same call, its derivative along the path,
+    The v branch is the network at h = 0, the u branch at h. Its derivative along the path,
 
         D_t u = grad_z u . sg(v) + du/dt + du/dh,
 
-    a Jacobian-vector product with the tangent (sg(v), 1, 1) in (z, t, h). Why this tangent: r stays where it is while
-    t moves, so z moves with its velocity and both t and h = t - r grow at rate 1.
+    is a Jacobian-vector product with the tangent (sg(v), 1, 1) in (z, t, h). Why this tangent: r stays where it is
+    while t moves, so z moves with its velocity and both t and h = t - r grow at rate 1.
 
-    Where h = 0 the second pass would repeat the first and D_t u is multiplied by 0, so V = v there. Those samples,
-    half of the batch, take the first pass alone: the same loss for less work.
+    The same losses for less work than two passes over the batch:
+
+    - Where h = 0 both branches are the same and D_t u is multiplied by 0: those samples, half of the batch, pass once.
+    - u does not need v, only its derivative does: one call makes both branches.
+    - The derivative is a constant of the loss: it needs no graph to go back through.
 
     Args:
         target: e - x, the tangent of z when v is not supervised (then it is the plain MeanFlow objective, the paper's
@@ -89,15 +93,20 @@ def dual_pass(
         supervise_v: whether v is trained on all samples.
     """
     t, h, n = intervals
-    first = slice(None) if supervise_v else slice(n)  # only instants need the first pass if v is not supervised
-    v = u_fn(z[first], t[first], torch.zeros_like(t[first]), o[first])
-    tangent = v[n:].detach() if supervise_v else target[n:]
+    batch = (z, t, h, o)
+    if supervise_v:
+        at_h_0 = (z[n:], t[n:], torch.zeros_like(h[n:]), o[n:])
+        u, v_n = u_fn(*map(torch.cat, zip(batch, at_h_0, strict=True))).split([len(z), len(z) - n])
+        v = torch.cat([u[:n], v_n])
+        tangent = v_n.detach()
+    else:
+        u, v, tangent = u_fn(*batch), None, target[n:]
     ones = torch.ones_like(t[n:])
-    u, D_t_u = torch.func.jvp(  # type: ignore[misc]  # a third value comes only with has_aux
-        lambda z, t, h: u_fn(z, t, h, o[n:]), (z[n:], t[n:], h[n:]), (tangent.to(z.dtype), ones, ones)
-    )
-    V = u + h[n:, None, None] * D_t_u.detach()
-    return Velocities(V=torch.cat([v[:n], V]), v=v if supervise_v else None)
+    with torch.no_grad(), forward_ad.dual_level():
+        z_n, t_n, h_n = map(forward_ad.make_dual, (z[n:], t[n:], h[n:]), (tangent.to(z.dtype), ones, ones))
+        D_t_u = forward_ad.unpack_dual(u_fn(z_n, t_n, h_n, o[n:])).tangent
+    V = torch.cat([u[:n], u[n:] + h[n:, None, None] * D_t_u])
+    return Velocities(V, v)
 
 
 def adaptive_l2(error: Tensor, mask: Tensor, *, gamma: float, c: float) -> Tensor:

@@ -23,26 +23,28 @@ def test_rotation_turns_the_camera_frame_into_the_world_frame():
     np.testing.assert_allclose(mean / np.linalg.norm(mean), [1, 0, 0], atol=1e-12)
 
 
-def test_a_ray_meets_a_crop_exactly_if_one_of_its_points_lies_inside():
+def test_a_ray_is_inside_a_crop_exactly_between_entering_and_leaving():
     rng = np.random.default_rng(0)
     crop = Crop((-0.3, 0.2, 1.0), (0.4, 0.9, 1.5))
     origin = np.array([1.0, -1.0, 0.5])
     directions = rng.normal(size=(2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     along = np.linspace(0, 4, 4001)
-    inside = np.array([crop.contains(origin + along[:, None] * direction).any() for direction in directions])
-    meets = crop.meets(origin, directions)
-    assert meets[inside].all()  # never throws a point away
-    assert (meets & ~inside).sum() <= 2  # only rays that graze an edge between two of the 1 mm steps
-    assert 0 < inside.sum() < len(inside)
+    inside = np.array([crop.contains(origin + along[:, None] * direction) for direction in directions])
+    enter, leave = crop.span(origin, directions)
+    between = (enter[:, None] <= along) & (along <= leave[:, None])
+    assert 0 < inside.any(axis=1).sum() < len(inside)
+    np.testing.assert_array_equal(between, inside)
 
 
 def test_a_ray_parallel_to_a_face_is_judged_by_the_other_axes():
     crop = Crop((0, 0, 0), (1, 1, 1))
     direction = np.array([[1.0, 0.0, 0.0]])
-    assert crop.meets(np.array([-1.0, 0.5, 0.5]), direction).all()
-    assert not crop.meets(np.array([-1.0, 1.5, 0.5]), direction).any()
-    assert not crop.meets(np.array([2.0, 0.5, 0.5]), direction).any()  # behind the origin
+    for origin, expected in (([-1.0, 0.5, 0.5], (1, 2)), ([0.2, 0.5, 0.5], (0, 0.8))):
+        np.testing.assert_allclose(np.ravel(crop.span(np.array(origin), direction)), expected)
+    for beside_or_behind in ([-1.0, 1.5, 0.5], [2.0, 0.5, 0.5]):
+        enter, leave = crop.span(np.array(beside_or_behind), direction)
+        assert enter > leave
 
 
 def test_distance_to_a_sphere():

@@ -1,5 +1,7 @@
 """Ray casting against MuJoCo's own single-ray function, on a small scene with known geometry."""
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -22,6 +24,15 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
+MOVING_SCENE = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="2 2 0.1"/>
+    <body name="box" pos="0.5 0 0.1"><geom type="box" size="0.1 0.1 0.1"/></body>
+    <body pos="0.1 0 0.3"><joint type="slide" axis="0 0 1"/><geom type="sphere" size="0.2"/></body>
+  </worldbody>
+</mujoco>
+"""
 LOOKING_DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 CAMERA = Camera("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, 40, 40)
 EVERYTHING = Crop((-9, -9, -9), (9, 9, 9))
@@ -35,17 +46,35 @@ def scene():
     return model, data
 
 
-def test_points_equal_those_of_single_rays(scene):
-    model, data = scene
+def points_of_single_rays(model: mujoco.MjModel, data: mujoco.MjData) -> list[np.ndarray]:
     origin = np.asarray(CAMERA.position)
-    expected = []
+    points = []
     for direction in CAMERA.ray_directions():
         hit = np.zeros(1, dtype=np.int32)
         distance = mujoco.mj_ray(model, data, origin, direction, np.array([1, 1, 1, 0, 0, 0], np.uint8), 1, -1, hit)
         if distance >= 0:
-            expected.append(origin + distance * direction)
-    points = PointCloudCamera(CAMERA, EVERYTHING).capture(model, data)
-    np.testing.assert_allclose(points, expected, atol=1e-9)
+            points.append(origin + distance * direction)
+    return points
+
+
+def test_points_equal_those_of_single_rays(scene):
+    points = PointCloudCamera(CAMERA, EVERYTHING).capture(*scene)
+    np.testing.assert_allclose(points, points_of_single_rays(*scene), atol=1e-9)
+
+
+def test_points_follow_what_moves_what_is_moved_and_another_model():
+    camera = PointCloudCamera(CAMERA, EVERYTHING)
+    clouds = []
+    for _ in range(2):
+        model = mujoco.MjModel.from_xml_string(MOVING_SCENE)
+        data = mujoco.MjData(model)
+        for falling, sideways in ((0.0, 0.0), (0.3, 0.0), (1.7, 0.0), (0.3, 0.4)):  # 1.7: around the camera
+            data.qpos[0] = falling
+            model.body("box").pos[1] = sideways
+            mujoco.mj_forward(model, data)
+            clouds.append(camera.capture(model, data))
+            np.testing.assert_allclose(clouds[-1], points_of_single_rays(model, data), atol=1e-9)
+    assert all(len(a) != len(b) or not np.allclose(a, b) for a, b in itertools.pairwise(clouds))
 
 
 def test_a_crop_keeps_exactly_the_points_inside(scene):

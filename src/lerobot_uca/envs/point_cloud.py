@@ -62,18 +62,18 @@ class Crop:
         """Which of the points (N, 3) lie inside, (N,)."""
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
-    def meets(self, origin: Array, directions: Array) -> NDArray[np.bool_]:
-        """Which rays from origin (3,) along directions (R, 3) pass through the box, (R,).
+    def span(self, origin: Array, directions: Array) -> tuple[Array, Array]:
+        """Where rays from origin (3,) along directions (R, 3) enter and leave the box: two distances [m], (R,) each.
 
-        A ray that does not cannot give a point, so it need not be cast.
+        A ray that misses the box has enter > leave. It cannot give a point, so it need not be cast.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             to_low = (np.asarray(self.low) - origin) / directions
             to_high = (np.asarray(self.high) - origin) / directions
         # fmax and fmin drop the NaN of a ray that runs inside a face of the box.
-        enter = np.fmax.reduce(np.fmin(to_low, to_high), axis=1)
+        enter = np.fmax.reduce(np.fmin(to_low, to_high), axis=1, initial=0)
         leave = np.fmin.reduce(np.fmax(to_low, to_high), axis=1)
-        return (enter <= leave) & (leave >= 0)
+        return enter, leave
 
 
 def ray_sphere_distances(origin: Array, directions: Array, centre: Array, radius: float) -> Array:

@@ -5,6 +5,8 @@ geoms and which `mj_multiRay` therefore passes through).
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from typing import NamedTuple
 
 import mujoco
@@ -15,8 +17,12 @@ from lerobot_uca.envs.point_cloud import Array, Camera, Crop, ray_sphere_distanc
 
 # Groups 0 to 2 are what MuJoCo's renderer draws; 3 to 5 hold collision shapes and trackers.
 VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
+HIDDEN_GROUP = 5
+ROUNDING = 1e-9  # [m], far above that of a distance and far below what a camera resolves
 BACKGROUND = np.array([235, 238, 242], dtype=np.uint8)
 DEFAULT_GEOM_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+
+Indices = NDArray[np.intp]
 
 
 class Marker(NamedTuple):
@@ -30,39 +36,94 @@ class Marker(NamedTuple):
 class _Hits(NamedTuple):
     distance: Array  # (R,) [m], inf where nothing was hit
     geom: NDArray[np.int32]  # (R,), -1 where nothing was hit
-    normal: Array | None  # (R, 3), unit
+    normal: Array  # (R, 3), unit; (R, 0) without normals
+
+    def copy(self) -> "_Hits":
+        return _Hits(self.distance.copy(), self.geom.copy(), self.normal.copy())
+
+    def put_nearer(self, rays: Indices, other: "_Hits") -> None:
+        """Replace those of the rays (R',) that the other hits, R' of them, are nearer on."""
+        nearer = other.distance < self.distance[rays]
+        rays = rays[nearer]
+        self.distance[rays] = other.distance[nearer]
+        self.geom[rays] = other.geom[nearer]
+        self.normal[rays] = other.normal[nearer]
 
 
 class _RayCaster:
-    """Casts the same rays again and again; directions and buffers are made once."""
+    """Casts the same rays again and again.
+
+    Three things make it fast: what is fixed to the world is cast once, and again only when the model or one of its
+    poses is another one (its shapes and colours must stay); only rays that meet the bounding sphere of something that
+    moves are cast at what moves; and two threads share them.
+    """
 
     def __init__(self, origin: Array, directions: Array, *, with_normals: bool) -> None:
         self.origin = origin
-        self.directions = np.ascontiguousarray(directions)
-        n_rays = len(directions)
-        self._distance = np.empty(n_rays)
-        self._geom = np.empty(n_rays, dtype=np.int32)
-        self._normal = np.empty(3 * n_rays) if with_normals else None
+        self.directions = directions
+        self._with_normals = with_normals
+        self._second_thread = ThreadPoolExecutor(max_workers=1)  # starts with the first cast
+        self._model: mujoco.MjModel | None = None
 
     def cast(self, model: mujoco.MjModel, data: mujoco.MjData) -> _Hits:
-        """The nearest visible surface along each ray. The arrays are overwritten by the next call."""
+        """The nearest visible surface along each ray."""
+        if model is not self._model:
+            self._model = model
+            self._moves = model.body_weldid[model.geom_bodyid] != 0  # (ngeom,)
+            self._second_data = mujoco.MjData(model)
+            self._fixed_poses = np.empty(0)
+        poses = np.hstack([data.geom_xpos, data.geom_xmat])[~self._moves & _is_visible(model)]
+        if not np.array_equal(poses, self._fixed_poses):
+            self._fixed_poses = poses
+            without_moving = copy(model)
+            without_moving.geom_group[self._moves] = HIDDEN_GROUP
+            self._fixed_hits = self._cast(np.arange(len(self.directions)), without_moving, data, at_fixed=True)
+        hits = self._fixed_hits.copy()
+        rays = self._rays_near(model, data, self._moves & _is_visible(model))
+        # Every other ray each, so that both meet as many surfaces. MuJoCo works in the data: each thread needs its own.
+        first, second = rays[::2], rays[1::2]
+        mujoco.mj_copyData(self._second_data, model, data)
+        second_hits = self._second_thread.submit(self._cast, second, model, self._second_data, at_fixed=False)
+        hits.put_nearer(first, self._cast(first, model, data, at_fixed=False))
+        hits.put_nearer(second, second_hits.result())
+        return hits
+
+    def _rays_near(self, model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool_]) -> Indices:
+        """Which rays (R',) meet the bounding sphere of one of the geoms."""
+        to_centre = data.geom_xpos[geoms] - self.origin
+        tangent_squared = np.sum(to_centre**2, axis=1) - model.geom_rbound[geoms] ** 2
+        # The rays that meet a sphere are those that make no larger an angle with its centre than its tangents do.
+        tangent = np.where(tangent_squared > 0, np.sqrt(np.maximum(tangent_squared, 0)), -np.inf)
+        return np.flatnonzero(np.any(self.directions @ to_centre.T >= tangent, axis=1))
+
+    def _cast(self, rays: Indices, model: mujoco.MjModel, data: mujoco.MjData, *, at_fixed: bool) -> _Hits:
+        hits = _Hits(
+            distance=np.empty(len(rays)),
+            geom=np.empty(len(rays), np.int32),
+            normal=np.empty((len(rays), 3 if self._with_normals else 0)),
+        )
         mujoco.mj_multiRay(
             m=model,
             d=data,
             pnt=self.origin,
-            vec=self.directions.ravel(),
+            vec=self.directions[rays].ravel(),
             geomgroup=VISIBLE_GROUPS,
-            flg_static=True,
+            flg_static=at_fixed,
             bodyexclude=-1,
-            geomid=self._geom,
-            dist=self._distance,
-            normal=self._normal,
-            nray=len(self.directions),
+            geomid=hits.geom,
+            dist=hits.distance,
+            normal=hits.normal.ravel() if self._with_normals else None,
+            nray=len(rays),
             cutoff=mujoco.mjMAXVAL,
         )
-        self._distance[self._geom < 0] = np.inf
-        normal = None if self._normal is None else self._normal.reshape(-1, 3)
-        return _Hits(self._distance, self._geom, normal)
+        hits.distance[hits.geom < 0] = np.inf
+        return hits
+
+
+def _is_visible(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    """Which geoms rays may hit, (ngeom,)."""
+    is_transparent = (model.geom_matid < 0) & (model.geom_rgba[:, 3] == 0)
+    return (VISIBLE_GROUPS[model.geom_group] == 1) & ~is_transparent
 
 
 class PointCloudCamera:
@@ -77,7 +138,10 @@ class PointCloudCamera:
         origin = np.asarray(camera.position)
         directions = camera.ray_directions()
         self.camera, self.crop = camera, crop
-        self._caster = _RayCaster(origin, directions[crop.meets(origin, directions)], with_normals=False)
+        enter, leave = crop.span(origin, directions)
+        meets = enter <= leave
+        self._caster = _RayCaster(origin, directions[meets], with_normals=False)
+        self._enter, self._leave = enter[meets] - ROUNDING, leave[meets] + ROUNDING
 
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
         """Visible points inside the crop, (N, 3), world frame [m]. `data` must be up to date (`mj_forward`)."""
@@ -86,8 +150,8 @@ class PointCloudCamera:
         for marker in markers:
             to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)
             np.minimum(distance, to_marker, out=distance)
-        hit = np.isfinite(distance)
-        points = caster.origin + caster.directions[hit] * distance[hit, None]
+        near = (distance >= self._enter) & (distance <= self._leave)
+        points = caster.origin + caster.directions[near] * distance[near, None]
         return points[self.crop.contains(points)]
 
 
@@ -102,7 +166,6 @@ class PictureCamera:
         """The picture, (H, W, 3) uint8."""
         caster = self._caster
         distance, geom, normal = caster.cast(model, data)
-        assert normal is not None
         colour = surface_colours(model)[geom]
         for marker in markers:
             to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)

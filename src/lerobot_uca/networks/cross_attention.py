@@ -35,7 +35,8 @@ class CrossAttentionBlock(nn.Module):
 
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
-        self.attention = nn.Sequential(nn.LayerNorm(dim), SelfAttention(dim, n_heads))
+        self.norm = nn.LayerNorm(dim)
+        self.attention = SelfAttention(dim, n_heads)
         self.norm_actions, self.norm_conditions = nn.LayerNorm(dim), nn.LayerNorm(dim)
         self.cross_attention = CrossAttention(dim, n_heads)
         self.feed_forward = nn.Sequential(
@@ -44,7 +45,7 @@ class CrossAttentionBlock(nn.Module):
 
     def forward(self, Y: Tensor, P: Tensor) -> Tensor:
         """Y (B, T, D) and P (B, S, D) to (B, T, D)."""
-        Y = Y + self.attention(Y)
+        Y = Y + self.attention(self.norm(Y), n_out=Y.shape[1])
         Y = Y + self.cross_attention(self.norm_actions(Y), self.norm_conditions(P))
         return Y + self.feed_forward(Y)
 

@@ -6,11 +6,16 @@ Letters: B samples, O observation steps, N points, S state dimensions, F feature
 import torch
 from torch import Tensor, nn
 
+CPU_CLOUDS = 16  # at once: what they need stays in a CPU's cache; with more, the forward pass is twice as slow
+
 
 class PointEncoder(nn.Module):
     """A small PointNet, the same in DP3, FlowPolicy and MP1: per-point layers, max over the points, projection.
 
     The order of the points does not matter.
+
+    In training, a point gets a gradient only through the features in which it is its cloud's largest. So the winners
+    are found without a graph, and only they, 20 to 40 % of the points, pass the layers once more to be differentiated.
     """
 
     def __init__(self, widths: tuple[int, ...], n_features: int) -> None:
@@ -18,12 +23,31 @@ class PointEncoder(nn.Module):
         layers: list[nn.Module] = []
         for n_in, n_out in zip((3, *widths[:-1]), widths, strict=True):
             layers += [nn.Linear(n_in, n_out), nn.LayerNorm(n_out), nn.ReLU()]
-        self.per_point = nn.Sequential(*layers)
-        self.project = nn.Sequential(nn.Linear(widths[-1], n_features), nn.LayerNorm(n_features))
+        self.per_point = nn.Sequential(*layers[:-1])
+        # The last ReLU comes after the maximum: the same result, on far fewer values.
+        self.project = nn.Sequential(nn.ReLU(), nn.Linear(widths[-1], n_features), nn.LayerNorm(n_features))
 
     def forward(self, points: Tensor) -> Tensor:
         """(..., N, 3) to (..., F)."""
-        return self.project(self.per_point(points).amax(dim=-2))
+        clouds = points.flatten(0, -3)
+        largest = self._largest_of_winners if torch.is_grad_enabled() else self._largest
+        return self.project(largest(clouds).unflatten(0, points.shape[:-2]))
+
+    def _largest(self, clouds: Tensor) -> Tensor:
+        """(B, N, 3) to (B, C)."""
+        return torch.cat([self.per_point(some).amax(dim=1) for some in _some_at_once(clouds)])
+
+    def _largest_of_winners(self, clouds: Tensor) -> Tensor:
+        """The same with a graph to go back through."""
+        with torch.no_grad():
+            winners = torch.cat([self.per_point(some).max(dim=1).indices for some in _some_at_once(clouds)])
+        wins = torch.zeros(clouds.shape[:2], dtype=torch.bool, device=clouds.device).scatter_(1, winners, True)
+        row = wins.flatten().cumsum(0).view_as(wins) - 1  # of a winner in the list of all winners
+        return self.per_point(clouds[wins]).gather(0, row.gather(1, winners))
+
+
+def _some_at_once(clouds: Tensor) -> tuple[Tensor, ...]:
+    return clouds.split(CPU_CLOUDS) if clouds.device.type == "cpu" else (clouds,)
 
 
 class ObservationEncoder(nn.Module):

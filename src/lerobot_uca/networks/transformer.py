@@ -25,10 +25,10 @@ class SelfAttention(nn.Module):
         self.qkv = nn.Linear(dim, 3 * dim)
         self.out = nn.Linear(dim, dim)
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """(B, S, D) to (B, S, D)."""
+    def forward(self, tokens: Tensor, n_out: int) -> Tensor:
+        """(B, S, D) to what the last n_out tokens get from all, (B, n_out, D)."""
         q, k, v = self.qkv(tokens).unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)  # (B, heads, S, d)
-        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
+        weights = torch.softmax((q[:, :, -n_out:] * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
         return self.out((weights @ v).transpose(1, 2).flatten(-2))
 
 
@@ -37,14 +37,15 @@ class Block(nn.Module):
 
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
-        self.attention = nn.Sequential(nn.LayerNorm(dim), SelfAttention(dim, n_heads))
+        self.norm = nn.LayerNorm(dim)
+        self.attention = SelfAttention(dim, n_heads)
         self.feed_forward = nn.Sequential(
             nn.LayerNorm(dim), nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim)
         )
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """(B, S, D) to (B, S, D)."""
-        tokens = tokens + self.attention(tokens)
+    def forward(self, tokens: Tensor, n_out: int) -> Tensor:
+        """(B, S, D) to the last n_out tokens, (B, n_out, D)."""
+        tokens = tokens[:, -n_out:] + self.attention(self.norm(tokens), n_out)
         return tokens + self.feed_forward(tokens)
 
 
@@ -105,8 +106,9 @@ class UnifiedTransformer(ConditionActionTransformer):
     block = Block
 
     def refine(self, P: Tensor, Y: Tensor) -> Tensor:
-        """All tokens go through all blocks; the conditions' are dropped at the end."""
+        """All tokens go through the blocks; of the last one only the actions are read."""
         tokens = torch.cat([P, Y], dim=1)
-        for block in self.blocks:
-            tokens = block(tokens)
-        return tokens[:, -Y.shape[1] :]
+        *earlier, last = self.blocks
+        for block in earlier:
+            tokens = block(tokens, n_out=tokens.shape[1])
+        return last(tokens, n_out=Y.shape[1])  # what nobody reads is not computed
