@@ -17,6 +17,8 @@ for part in (
     "policies.configuration_uca_flow",
     "policies.configuration_dp3",
     "policies.configuration_simple_dp3",
+    "policies.configuration_flow",
+    "policies.configuration_mp1",
     "envs.configs",
     "data.reading",
 ):

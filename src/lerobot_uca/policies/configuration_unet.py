@@ -25,6 +25,9 @@ class UNetPolicyConfig(PointCloudPolicyConfig):
     @override
     def validate_sizes(self) -> None:
         super().validate_sizes()
+        for name in ("unet_blocks", "unet_groups"):
+            if getattr(self, name) < 1:
+                raise UserError(f"policy.{name} must be at least 1, got {getattr(self, name)}.")
         if not self.unet_widths or any(width < 1 or width % self.unet_groups for width in self.unet_widths):
             raise UserError(
                 f"policy.unet_widths must be multiples of unet_groups = {self.unet_groups}, "
@@ -35,8 +38,6 @@ class UNetPolicyConfig(PointCloudPolicyConfig):
                 f"policy.horizon must be a multiple of {2 ** (len(self.unet_widths) - 1)}, for each of the "
                 f"{len(self.unet_widths)} unet_widths but the last halves it, got {self.horizon}."
             )
-        if self.unet_blocks < 1:
-            raise UserError(f"policy.unet_blocks must be at least 1, got {self.unet_blocks}.")
         if self.unet_kernel_size < 1 or self.unet_kernel_size % 2 == 0:
             raise UserError(f"policy.unet_kernel_size must be odd, got {self.unet_kernel_size}.")
         if self.time_dim < 4 or self.time_dim % 2:
