@@ -6,11 +6,10 @@ It registers policies and environments, gives datasets batched reading, and keep
 import importlib
 import logging
 
-from lerobot_uca.terminal import check_output_folder_before_training, quiet_video_decoder, report_errors_in_one_line
+from lerobot_uca.terminal import quiet_video_decoder, report_errors_in_one_line
 
 report_errors_in_one_line()
 quiet_video_decoder()
-check_output_folder_before_training()
 
 # A missing optional dependency of one part must never take another part down.
 for part in (
@@ -21,6 +20,7 @@ for part in (
     "policies.configuration_mp1",
     "envs.configs",
     "data.reading",
+    "training",
 ):
     try:
         importlib.import_module(f"lerobot_uca.{part}")

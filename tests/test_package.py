@@ -19,6 +19,7 @@ ALLOWED = {
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
+    "training": {"data", "policies", "errors"},
     "commands": {"data"},
 }
 
