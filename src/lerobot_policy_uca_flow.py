@@ -12,7 +12,16 @@ report_errors_in_one_line()
 quiet_video_decoder()
 
 # A missing optional dependency of one part must never take another part down.
-for part in ("policies.configuration_uca_flow", "envs.configs", "data.reading", "training"):
+for part in (
+    "policies.configuration_uca_flow",
+    "policies.configuration_dp3",
+    "policies.configuration_simple_dp3",
+    "policies.configuration_flow",
+    "policies.configuration_mp1",
+    "envs.configs",
+    "data.reading",
+    "training",
+):
     try:
         importlib.import_module(f"lerobot_uca.{part}")
     except ImportError as error:
