@@ -14,7 +14,7 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 
 # What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
 ALLOWED = {
-    "policies": {"meanflow", "networks", "errors", "features"},
+    "policies": {"meanflow", "networks", "onnx_runtime", "errors", "features"},
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},

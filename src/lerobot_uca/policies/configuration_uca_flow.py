@@ -29,6 +29,9 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # Interval tokens N_h; likewise.
     n_interval_tokens: int = 4
 
+    # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
+    inference: str = "onnxruntime"
+
     # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
     dual_pass: bool = True
     # Of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with 0.5 and 0.001 it is MP1's.
