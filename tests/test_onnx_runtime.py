@@ -58,6 +58,13 @@ def test_changed_weights_are_noticed():
     torch.testing.assert_close(function(other, x), other(x).detach(), atol=1e-5, rtol=0)  # another network
 
 
+@pytest.mark.parametrize("training", [True, False])
+def test_tracing_leaves_the_networks_mode_alone(training):
+    network = make_network().train(training)
+    OnnxFunction(call)(network, torch.randn(2, 3))
+    assert all(module.training == training for module in network.modules())
+
+
 def test_tracing_knows_neither_autocast_nor_inference_mode():
     network, x = make_network(), torch.randn(2, 3)
     expected = network(x).detach()

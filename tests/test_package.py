@@ -18,7 +18,8 @@ ALLOWED = {
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
-    "commands": {"data"},
+    "export": {"policies", "onnx_runtime", "errors", "features"},
+    "commands": {"data", "export"},
 }
 
 
@@ -56,7 +57,7 @@ def test_the_installed_name_keeps_its_underscores():
 
 def test_only_our_console_commands_are_installed():
     scripts = importlib.metadata.distribution(DISTRIBUTION).entry_points
-    assert {script.name for script in scripts} == {"lerobot-uca-collect"}
+    assert {script.name for script in scripts} == {"lerobot-uca-collect", "lerobot-uca-export"}
 
 
 def test_a_wheel_holds_the_package_and_nothing_else(tmp_path):

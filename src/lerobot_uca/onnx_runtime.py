@@ -85,6 +85,7 @@ class _Function(nn.Module):
         super().__init__()
         self.function = function
         self.network = network
+        self.training = network.training  # the exporter sets both to what this one was
 
     def forward(self, *inputs: Tensor) -> Tensor:
         return self.function(self.network, *inputs)
