@@ -93,16 +93,24 @@ def make(
 
 def plain_step(policy: UCAFlowPolicy, batch: dict[str, torch.Tensor]) -> None:
     """The matrix products of the method as the paper writes it down."""
-    encoder, network, x = policy.model.encoder, policy.model.generator, batch["action"]
+    x = batch["action"]
+    encoder: Any = policy.model.encoder
+    network: Any = policy.model.generator
     per_point = encoder.points.per_point(batch[OBS_POINT_CLOUD][..., : policy.config.n_points, :])
     state = encoder.state(batch["observation.state"])
     o = torch.cat([encoder.points.project(per_point.amax(dim=-2)), state], dim=-1)
-    n_unread = o.shape[1] + policy.config.n_timestep_tokens + policy.config.n_interval_tokens
     t, instant = torch.ones(len(x), device=x.device), torch.zeros(len(x), device=x.device)
-    network.horizon += n_unread
+
+    def refine_all(P: torch.Tensor, Y: torch.Tensor) -> torch.Tensor:
+        tokens = torch.cat([P, Y], dim=1)
+        for block in network.blocks:
+            tokens = block(tokens, n_out=tokens.shape[1])
+        return tokens[:, -Y.shape[1] :]
+
+    network.refine = refine_all
     v = network(x, t, instant, o)
     u, _ = torch.func.jvp(lambda z, t, h: network(z, t, h, o), (x, t, t), (x, t, t))  # type: ignore[misc]
-    network.horizon -= n_unread
+    del network.refine
     (u + v).mean().backward()
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -17,6 +18,7 @@ from safetensors.torch import load_file
 
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.onnx_runner import OnnxPolicy
 from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, TINY_UNET, write_dataset
 
 BIN = Path(sys.executable).parent
@@ -113,6 +115,13 @@ def test_evaluation_reports_success_and_videos(checkpoint, tmp_path):
     assert Path(overall["video_paths"][0]).stat().st_size > 1000
 
 
+def test_an_exported_checkpoint_acts_without_torch(checkpoint, tmp_path):
+    output = succeed("lerobot-uca-export", checkpoint, "--format=onnx", f"--output={tmp_path}/policy.onnx")
+    assert f"inputs point_cloud (2, {N_POINTS}, 3), state (2, {N_STATES}), noise (4, {N_ACTIONS})" in output
+    policy = OnnxPolicy(tmp_path / "policy.onnx")
+    assert policy.select_action(np.zeros((N_POINTS, 3)), np.zeros(N_STATES)).shape == (N_ACTIONS,)
+
+
 def test_training_resumes_with_its_averaged_weights(trained):
     config = trained / "train" / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
     succeed("lerobot-train", f"--config_path={config}", "--resume=true", "--steps=3")
@@ -150,6 +159,10 @@ def test_an_unknown_task(tmp_path):
     )
     assert line.startswith("error: Unknown task 'hamer'. Meta-World tasks: hammer, ")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_exporting_what_is_no_checkpoint(tmp_path):
+    assert "has no config.json. A checkpoint is a folder like" in fail("lerobot-uca-export", tmp_path)
 
 
 def test_training_finds_an_unknown_task_before_its_first_step(dataset_root, tmp_path):

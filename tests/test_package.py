@@ -14,13 +14,14 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 
 # What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
 ALLOWED = {
-    "policies": {"meanflow", "objectives", "networks", "errors", "features"},
+    "policies": {"meanflow", "objectives", "networks", "onnx_runtime", "errors", "features"},
     "objectives": {"meanflow", "networks"},
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
     "training": {"data", "policies", "errors"},
-    "commands": {"data"},
+    "export": {"policies", "onnx_runtime", "errors", "features"},
+    "commands": {"data", "export"},
 }
 
 
@@ -58,7 +59,7 @@ def test_the_installed_name_keeps_its_underscores():
 
 def test_only_our_console_commands_are_installed():
     scripts = importlib.metadata.distribution(DISTRIBUTION).entry_points
-    assert {script.name for script in scripts} == {"lerobot-uca-collect"}
+    assert {script.name for script in scripts} == {"lerobot-uca-collect", "lerobot-uca-export"}
 
 
 def test_a_wheel_holds_the_package_and_nothing_else(tmp_path):

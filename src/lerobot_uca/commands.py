@@ -18,3 +18,13 @@ def collect() -> None:
         for argument, has_value in zip(sys.argv[1:], followed_by_value, strict=False)
     ]
     run()
+
+
+def export() -> None:
+    """`lerobot-uca-export`."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_uca.export import run
+
+    register_third_party_plugins()
+    run()

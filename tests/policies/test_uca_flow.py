@@ -1,6 +1,7 @@
 """What LeRobot and its users rely on."""
 
 import copy
+import dataclasses
 import re
 
 import pytest
@@ -95,7 +96,57 @@ def test_a_seed_reproduces_actions_and_losses(policy):
     assert torch.equal(runs[0][1], runs[1][1])
 
 
+@pytest.mark.parametrize(
+    "changes", [{}, {"n_points": 10}, {"n_obs_steps": 1, "horizon": 3}, {"dim": 64, "n_layers": 4}]
+)
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_onnx_runtime_gives_pytorchs_actions(changes, batch_size):
+    fast = UCAFlowPolicy(make_config(**changes)).eval()
+    reference = copy.deepcopy(fast)
+    reference.config = dataclasses.replace(fast.config, inference="eager")
+    for _ in range(7):
+        observation = make_observation(batch_size)
+        noise = torch.randn(batch_size, fast.config.horizon, N_ACTIONS)
+        actions = [policy.select_action(observation, noise=noise) for policy in (fast, reference)]
+        torch.testing.assert_close(*actions, atol=1e-5, rtol=0)
+
+
+def test_trained_on_weights_are_used_by_the_next_plan(policy):
+    noise, observation = torch.randn(1, T, N_ACTIONS), make_observation()
+    before = policy.predict_action_chunk(observation, noise=noise)
+    for _ in range(5):
+        policy.update()
+    policy.reset()
+    after = policy.predict_action_chunk(observation, noise=noise)
+    assert not torch.allclose(after, before, atol=1e-3)
+    torch.testing.assert_close(
+        after, policy.predict_action_chunk(history(observation, observation), noise=noise), atol=1e-5, rtol=0
+    )
+
+
+def test_a_frame_is_encoded_once_when_it_arrives_if_a_plan_will_see_it(policy):
+    policy.config.inference = "eager"
+    calls: list[int] = []
+    policy.ema_model.encoder.register_forward_hook(lambda *_: calls.append(1))
+    n_encoded = []
+    for _ in range(7):
+        before = len(calls)
+        policy.select_action(make_observation())
+        n_encoded.append(len(calls) - before)
+    assert n_encoded == [1, 0, 1, 1, 0, 1, 1]  # plans are made in steps 0, 3 and 6, from two frames
+
+
+def test_a_policy_that_has_acted_can_be_copied(policy):
+    noise, observation = torch.randn(1, T, N_ACTIONS), make_observation()
+    expected = policy.predict_action_chunk(observation, noise=noise)
+    duplicate = copy.deepcopy(policy)
+    duplicate.reset()
+    assert torch.equal(duplicate.predict_action_chunk(observation, noise=noise), expected)
+    assert duplicate._generate_function.eager.__self__ is duplicate
+
+
 def test_one_network_call_makes_a_chunk(policy):
+    policy.config.inference = "eager"
     calls = []
     policy.ema_model.generator.register_forward_hook(lambda *_: calls.append(1))
     policy.predict_action_chunk(make_observation())
@@ -248,6 +299,7 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
         ({"n_points": 0}, "policy.n_points must be at least 1 or null (all points), got 0"),
         ({"dtype": "float16"}, "policy.dtype must be float32 or bfloat16, got 'float16'"),
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
+        ({"inference": "tensorrt"}, "policy.inference must be eager or onnxruntime, got 'tensorrt'"),
         ({"n_layers": 0}, "policy.n_layers must be at least 1, got 0"),
         (
             {"conditioning": "film"},

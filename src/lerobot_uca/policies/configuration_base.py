@@ -45,6 +45,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # Features of a robot state (the baselines').
     n_state_features: int = 64
 
+    # What computes actions on a CPU: eager (PyTorch, the reference) or onnxruntime (the same to rounding, faster for
+    # small networks). On other devices it is always PyTorch.
+    inference: str = "eager"
     # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). LeRobot also evaluates with it
     # during training; lerobot-eval uses float32 unless told policy.use_amp=true.
     dtype: str = "float32"
@@ -80,6 +83,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             raise UserError(f"policy.n_points must be at least 1 or null (all points), got {self.n_points}.")
         if self.dtype not in ("float32", "bfloat16"):
             raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
+
+        if self.inference not in ("eager", "onnxruntime"):
+            raise UserError(f"policy.inference must be eager or onnxruntime, got '{self.inference}'.")
 
     def validate_features(self) -> None:
         """Keep of the dataset's features what the policy uses: a cloud, a state and an action.

@@ -33,6 +33,9 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # How conditions reach the actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
     # same size to within 10 %).
     conditioning: str = "unified"
+    # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
+    inference: str = "onnxruntime"
+
     # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
     dual_pass: bool = True
     # Of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with 0.5 and 0.001 it is MP1's.

@@ -9,13 +9,14 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
+from dataclasses import dataclass
+from operator import call
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, NamedTuple, NoReturn, Self
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.policies.utils import populate_queues
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors import SafetensorError
 from torch import Tensor, nn
@@ -23,6 +24,7 @@ from torch import Tensor, nn
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.networks.observation_encoder import ObservationEncoder
+from lerobot_uca.onnx_runtime import OnnxFunction
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 
 OBSERVATION_KEYS = (OBS_POINT_CLOUD, OBS_STATE)
@@ -35,6 +37,14 @@ class Model(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.generator = generator
+
+
+@dataclass
+class Frame:
+    """One step's observation and, once a plan needs them, its features (B, 1, F)."""
+
+    observation: dict[str, Tensor]
+    features: Tensor | None = None
 
 
 class MethodLoss(NamedTuple):
@@ -74,6 +84,8 @@ class PointCloudPolicy(PreTrainedPolicy):
         self.model = Model(encoder, self.make_generator())
         self.ema_model = deepcopy(self.model).requires_grad_(False)
         self.register_buffer("ema_step", torch.zeros((), dtype=torch.long))
+        self._encoder_function = OnnxFunction(call)
+        self._generate_function = OnnxFunction(self.generate)
         self.reset()
 
     @abstractmethod
@@ -118,7 +130,8 @@ class PointCloudPolicy(PreTrainedPolicy):
         parts = {name: value.mean().item() for name, value in loss.parts.items()}
         mean = loss.total.mean()
         if not torch.isfinite(mean):
-            self._explain_non_finite(batch, (*OBSERVATION_KEYS, ACTION))
+            self._check_finite(batch, (*OBSERVATION_KEYS, ACTION))
+            self._raise_diverged()
         return (mean if reduction == "mean" else loss.total), parts
 
     @torch.no_grad()
@@ -132,9 +145,7 @@ class PointCloudPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget observations and planned actions: an episode begins."""
-        self._history: dict[str, deque[Tensor]] = {
-            key: deque(maxlen=self.config.n_obs_steps) for key in OBSERVATION_KEYS
-        }
+        self._history: deque[Frame] = deque(maxlen=self.config.n_obs_steps)
         self._planned: deque[Tensor] = deque()
 
     @torch.no_grad()
@@ -146,9 +157,11 @@ class PointCloudPolicy(PreTrainedPolicy):
                 and the first one stands for those before it.
             noise: (B, T, A), drawn if not given.
         """
-        self._remember(batch)
+        frame = self._remember(batch)
         if not self._planned:
-            self._planned.extend(self._plan(self._remembered(), noise).unbind(dim=1))
+            self._planned.extend(self._plan_from_remembered(noise).unbind(dim=1))
+        elif len(self._planned) < self.config.n_obs_steps:  # the next plan will see this frame
+            self._encode_once(frame)
         return self._planned.popleft()
 
     @torch.no_grad()
@@ -157,41 +170,64 @@ class PointCloudPolicy(PreTrainedPolicy):
 
         Args:
             batch: normalised; either the newest observation, (B, N, 3) and (B, S), which is remembered for the
-                next call, or a whole history, (B, O, N, 3) and (B, O, S), which is not.
+                next call, or a whole history, (B, O, N, 3) and (B, O, S), which is not. The latter is always computed
+                by PyTorch.
             noise: (B, T, A), drawn if not given.
         """
-        if _get(batch, OBS_POINT_CLOUD).ndim == 4:
-            return self._plan(batch, noise)
-        self._remember(batch)
-        return self._plan(self._remembered(), noise)
+        if _get(batch, OBS_POINT_CLOUD).ndim == 3:
+            self._remember(batch)
+            return self._plan_from_remembered(noise)
+        self._check_shapes(batch, self.config.n_obs_steps)
+        self._check_finite(batch, OBSERVATION_KEYS)
+        model = self.active_model
+        o = self._encode(model, batch)
+        return self._executed(self.generate(model.generator, self._noise_like(o, noise), o))
 
     @property
     def active_model(self) -> Model:
         """The trained model in training mode, its moving average in eval mode."""
         return self.model if self.training else self.ema_model
 
-    def _remember(self, batch: Mapping[str, Tensor]) -> None:
-        self._check_shapes({key: _get(batch, key)[:, None] for key in OBSERVATION_KEYS}, n_obs=1)
-        populate_queues(self._history, {key: _get(batch, key) for key in OBSERVATION_KEYS})
+    def _remember(self, batch: Mapping[str, Tensor]) -> Frame:
+        observation = {key: _get(batch, key)[:, None] for key in OBSERVATION_KEYS}
+        self._check_shapes(observation, n_obs=1)
+        self._check_finite(observation, OBSERVATION_KEYS)
+        frame = Frame(observation)
+        n_missing = self.config.n_obs_steps if not self._history else 1
+        self._history.extend([frame] * n_missing)
+        return frame
 
-    def _remembered(self) -> dict[str, Tensor]:
-        return {key: torch.stack(list(frames), dim=1) for key, frames in self._history.items()}
+    def _encode_once(self, frame: Frame) -> Tensor:
+        if frame.features is None:
+            cloud, state = (frame.observation[key] for key in OBSERVATION_KEYS)
+            frame.features = self._compute(
+                self._encoder_function, self.active_model.encoder, cloud[..., : self.config.n_points, :], state
+            )
+        return frame.features
 
-    def _plan(self, history: Mapping[str, Tensor], noise: Tensor | None) -> Tensor:
-        self._check_shapes(history, self.config.n_obs_steps)
-        state = history[OBS_STATE]
-        if noise is None:
-            noise = torch.randn(len(state), self.config.horizon, self.config.n_actions, device=state.device)
-        model = self.active_model
-        actions = self.generate(model.generator, noise, self._encode(model, history))[:, self.config.executed]
-        # NaN and infinite points end up in the actions, which are far fewer to check; a robot must never get them.
-        if not torch.isfinite(actions).all():
-            self._explain_non_finite(history, OBSERVATION_KEYS)
-        return actions
+    def _plan_from_remembered(self, noise: Tensor | None) -> Tensor:
+        o = torch.cat([self._encode_once(frame) for frame in self._history], dim=1)
+        return self._executed(
+            self._compute(self._generate_function, self.active_model.generator, self._noise_like(o, noise), o)
+        )
+
+    def _compute(self, function: OnnxFunction, network: nn.Module, *inputs: Tensor) -> Tensor:
+        is_fast = self.config.inference == "onnxruntime" and not self.training and inputs[0].device.type == "cpu"
+        return function(network, *inputs) if is_fast else function.eager(network, *inputs)
 
     def _encode(self, model: Model, batch: Mapping[str, Tensor]) -> Tensor:
         cloud = batch[OBS_POINT_CLOUD][..., : self.config.n_points, :]
         return model.encoder(cloud, batch[OBS_STATE])
+
+    def _noise_like(self, o: Tensor, noise: Tensor | None) -> Tensor:
+        if noise is None:
+            noise = torch.randn(len(o), self.config.horizon, self.config.n_actions, device=o.device)
+        return noise
+
+    def _executed(self, actions: Tensor) -> Tensor:
+        if not torch.isfinite(actions).all():  # a robot must never get them
+            self._raise_diverged()
+        return actions[:, self.config.executed]
 
     # Bad input --------------------------------------------------------------------------------------------------
 
@@ -207,12 +243,13 @@ class PointCloudPolicy(PreTrainedPolicy):
         if tuple(state.shape) != expected:
             raise UserError(f"'{OBS_STATE}' must have shape {expected}, got {tuple(state.shape)}.")
 
-    def _explain_non_finite(self, batch: Mapping[str, Tensor], keys: Iterable[str]) -> NoReturn:
-        self.reset()  # the history holds what is wrong
+    def _check_finite(self, batch: Mapping[str, Tensor], keys: Iterable[str]) -> None:
         for key in keys:
-            n_bad = int((~torch.isfinite(batch[key])).sum())
-            if n_bad:
+            if not torch.isfinite(batch[key]).all():
+                n_bad = int((~torch.isfinite(batch[key])).sum())
                 raise UserError(f"'{key}' must be finite, got {n_bad} of {batch[key].numel()} values NaN or infinite.")
+
+    def _raise_diverged(self) -> NoReturn:
         raise FloatingPointError(
             f"Policy '{self.name}' made NaN or infinite values from finite observations: the training diverged."
         )

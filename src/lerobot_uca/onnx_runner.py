@@ -1,0 +1,90 @@
+"""Runs what `lerobot-uca-export` wrote: needs onnxruntime and numpy alone, so copy this file to the robot's computer.
+
+    policy = OnnxPolicy("policy.onnx")
+    while True:
+        robot.move(policy.select_action(point_cloud, state))
+
+Letters: O observation steps, N points, S state dimensions, T horizon, A action dimensions.
+"""
+
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+
+INPUTS = ("point_cloud", "state", "noise")
+MIN_ONNXRUNTIME = (1, 12)  # the first with opset 17
+
+
+class OnnxPolicy:
+    """An exported policy. Observations are raw, in the units of the training data; actions are in the robot's.
+
+    Args:
+        path: the file.
+        seed: of the noise that actions are made from; without one it is drawn.
+        n_threads: cores to use; 0 for all.
+
+    Raises:
+        ValueError: if the file is not such a policy, or if an observation has a wrong shape or is not finite.
+        RuntimeError: if onnxruntime is too old.
+    """
+
+    def __init__(self, path: str | Path, seed: int | None = None, n_threads: int = 0) -> None:
+        check_version(onnxruntime.__version__)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = n_threads
+        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        shapes = {tensor.name: tuple(tensor.shape) for tensor in self._session.get_inputs()}
+        if set(shapes) != set(INPUTS):
+            raise ValueError(f"'{path}' must have the inputs {', '.join(INPUTS)}, got {', '.join(shapes)}.")
+        self.n_obs_steps, *self._cloud_shape = shapes["point_cloud"]
+        self._state_shape = shapes["state"][1:]
+        self._noise_shape = shapes["noise"]
+        self._random = np.random.default_rng(seed)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget observations and planned actions: an episode begins."""
+        self._history: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=self.n_obs_steps)
+        self._planned: deque[np.ndarray] = deque()
+
+    def select_action(self, point_cloud: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """The next action (A,), from the newest point cloud (N, 3) and state (S,). Call it once every step."""
+        frame = (
+            _checked("point_cloud", point_cloud, self._cloud_shape),
+            _checked("state", state, self._state_shape),
+        )
+        self._history.extend([frame] * (1 if self._history else self.n_obs_steps))
+        if not self._planned:
+            clouds, states = zip(*self._history, strict=True)
+            self._planned.extend(self.plan(np.stack(clouds), np.stack(states)))
+        return self._planned.popleft()
+
+    def plan(self, point_clouds: np.ndarray, states: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
+        """Actions (n_action_steps, A), to be executed from now on, from a history, oldest first.
+
+        Args:
+            point_clouds: (O, N, 3) float32.
+            states: (O, S) float32.
+            noise: (T, A) float32, Gaussian; drawn if not given.
+        """
+        if noise is None:
+            noise = self._random.standard_normal(self._noise_shape, dtype=np.float32)
+        return self._session.run(None, {"point_cloud": point_clouds, "state": states, "noise": noise})[0]
+
+
+def check_version(version: str) -> None:
+    """Raise a `RuntimeError` if this version of onnxruntime is too old."""
+    if tuple(int(part) for part in version.split(".")[:2]) < MIN_ONNXRUNTIME:
+        minimum = ".".join(map(str, MIN_ONNXRUNTIME))
+        raise RuntimeError(f"onnxruntime must be at least {minimum}, got {version}.")
+
+
+def _checked(name: str, value: np.ndarray, shape: tuple[int, ...] | list[int]) -> np.ndarray:
+    array = np.asarray(value, dtype=np.float32)
+    if array.shape != tuple(shape):
+        raise ValueError(f"'{name}' must have shape {tuple(shape)}, got {array.shape}.")
+    if not np.isfinite(array).all():
+        raise ValueError(f"'{name}' must be finite, got NaN or infinite values.")
+    return array

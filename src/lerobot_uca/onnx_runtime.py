@@ -1,0 +1,100 @@
+"""Networks as ONNX Runtime computes them on a CPU: the fast path of inference, and what `lerobot-uca-export` writes.
+
+A step of a small network is mostly Python, small operations and reading weights. ONNX Runtime has none of the first,
+merges the second, computes once what does not depend on the inputs (the tokens of t = h = 1), and comes as a wheel, so
+that no compiler is needed.
+"""
+
+import io
+import warnings
+from collections.abc import Callable, Sequence
+
+import onnxruntime
+import torch
+from torch import Tensor, nn
+
+OPSET = 17  # the first with LayerNormalization
+
+
+class OnnxFunction:
+    """A function of a network and of tensors, computed by ONNX Runtime instead of PyTorch.
+
+    The network is traced, which takes about a second, when it is first called with inputs of new shapes, and again
+    when its weights have changed. The trace holds for all values of the inputs: the function must not branch on them.
+
+    Args:
+        eager: function(network, *inputs) in PyTorch: what is traced, and the reference.
+    """
+
+    def __init__(self, eager: Callable[..., Tensor]) -> None:
+        self.eager = eager
+        self._network: nn.Module | None = None
+        self._weights: list[Tensor] = []
+        self._versions: list[int] = []
+        self._sessions: dict[tuple[torch.Size, ...], onnxruntime.InferenceSession] = {}
+
+    def __reduce__(self) -> tuple[type["OnnxFunction"], tuple[Callable[..., Tensor]]]:
+        return OnnxFunction, (self.eager,)  # sessions can be neither copied nor sent to another process
+
+    def __call__(self, network: nn.Module, *inputs: Tensor) -> Tensor:
+        """The same as `eager(network, *inputs)` up to rounding. Inputs are float32 and on the CPU."""
+        if network is not self._network or self._versions != [weight._version for weight in self._weights]:
+            self._network = network
+            self._weights = [*network.parameters(), *network.buffers()]
+            self._versions = [weight._version for weight in self._weights]
+            self._sessions.clear()
+        shapes = tuple(tensor.shape for tensor in inputs)
+        if shapes not in self._sessions:
+            names = [f"input_{index}" for index in range(len(inputs))]
+            self._sessions[shapes] = _open(to_onnx(self.eager, network, shapes, names, "output"))
+        session = self._sessions[shapes]
+        feeds = {argument.name: tensor.numpy() for argument, tensor in zip(session.get_inputs(), inputs, strict=True)}
+        return torch.from_numpy(session.run(None, feeds)[0])
+
+
+def to_onnx(
+    function: Callable[..., Tensor],
+    network: nn.Module,
+    input_shapes: Sequence[Sequence[int]],
+    input_names: Sequence[str],
+    output_name: str,
+) -> bytes:
+    """function(network, *inputs) of float32 inputs of the given shapes as an ONNX model."""
+    file = io.BytesIO()
+    # LeRobot calls policies in inference mode and under autocast; a trace must know neither.
+    with torch.inference_mode(False), torch.no_grad(), torch.autocast("cpu", enabled=False), warnings.catch_warnings():
+        # PyTorch's newer exporter takes ten times as long and needs one more package; the older one warns of its age
+        # and of sizes becoming constants, which they are.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            _Function(function, network),
+            tuple(torch.zeros(*shape) for shape in input_shapes),
+            file,  # type: ignore[arg-type]  # a file in memory will do
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=list(input_names),
+            output_names=[output_name],
+        )
+    return file.getvalue()
+
+
+class _Function(nn.Module):
+    """What the exporter takes: a module."""
+
+    def __init__(self, function: Callable[..., Tensor], network: nn.Module) -> None:
+        super().__init__()
+        self.function = function
+        self.network = network
+        self.training = network.training  # the exporter sets both to what this one was
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.function(self.network, *inputs)
+
+
+def _open(model: bytes) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    # Between calls the cores belong to others, to the simulator for example.
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

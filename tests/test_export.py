@@ -1,0 +1,200 @@
+"""An exported file gives the policy's actions, from raw observations, with onnxruntime and numpy alone."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from lerobot.policies import make_policy_config, make_pre_post_processors
+
+from lerobot_uca import onnx_runner
+from lerobot_uca.errors import UserError
+from lerobot_uca.export import export
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.onnx_runner import OnnxPolicy
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_config
+
+
+def save(folder: Path, **changes: object) -> UCAFlowPolicy:
+    """Save a policy with processors of random statistics, as training does."""
+    policy = UCAFlowPolicy(make_config(**changes)).eval()
+    with torch.no_grad():
+        for parameter in policy.ema_model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    stats = {
+        key: {"min": -torch.rand(size), "max": 1 + torch.rand(size), "mean": torch.rand(size), "std": torch.rand(size)}
+        for key, size in ((OBS_POINT_CLOUD, 3), ("observation.state", N_STATES), ("action", N_ACTIONS))
+    }
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(policy.config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    return policy
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory) -> Path:
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("checkpoint")
+    save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(checkpoint) -> Path:
+    export(str(checkpoint), checkpoint / "policy.onnx")
+    return checkpoint / "policy.onnx"
+
+
+def actions_of_lerobots_loop(policy: UCAFlowPolicy, folder: Path, observations: list, noise: np.ndarray) -> np.ndarray:
+    pre, post = make_pre_post_processors(policy.config, pretrained_path=str(folder))
+    actions = []
+    for point_cloud, state in observations:
+        batch = pre(
+            {OBS_POINT_CLOUD: torch.from_numpy(point_cloud)[None], "observation.state": torch.from_numpy(state)}
+        )
+        actions.append(post(policy.select_action(batch, noise=torch.from_numpy(noise)[None]))[0].numpy())
+    return np.array(actions)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"n_points": 10, "n_obs_steps": 3, "horizon": 6, "n_action_steps": 2},
+        {"normalization_mapping": {"STATE": "MEAN_STD", "ACTION": "IDENTITY"}},
+    ],
+)
+def test_the_runner_acts_as_the_policy_in_lerobots_loop(tmp_path, changes, monkeypatch):
+    policy = save(tmp_path, **changes)
+    export(str(tmp_path), tmp_path / "policy.onnx")
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(policy.config.horizon, N_ACTIONS)).astype(np.float32)
+    observations = [
+        (rng.uniform(-1, 2, (N_POINTS, 3)).astype(np.float32), rng.uniform(-1, 2, N_STATES).astype(np.float32))
+        for _ in range(7)
+    ]
+    runner = OnnxPolicy(tmp_path / "policy.onnx")
+    plan = runner.plan
+    monkeypatch.setattr(runner, "plan", lambda clouds, states: plan(clouds, states, noise))
+    actions = np.array([runner.select_action(*observation) for observation in observations])
+    np.testing.assert_allclose(actions, actions_of_lerobots_loop(policy, tmp_path, observations, noise), atol=1e-5)
+    assert actions.shape == (7, N_ACTIONS)
+
+
+def test_the_file_holds_the_averaged_weights_alone(checkpoint, exported):
+    weights = (checkpoint / "model.safetensors").stat().st_size
+    assert 0.4 * weights < exported.stat().st_size < 0.7 * weights
+
+
+def test_a_seed_reproduces_actions_and_reset_forgets(exported):
+    cloud, state = np.zeros((N_POINTS, 3), np.float32), np.zeros(N_STATES, np.float32)
+    a, b = (OnnxPolicy(exported, seed=3) for _ in range(2))
+    first = a.select_action(cloud, state)
+    np.testing.assert_array_equal(first, b.select_action(cloud, state))
+    a.reset()
+    assert not np.array_equal(a.select_action(cloud, state), first)  # fresh noise, so it was planned anew
+
+
+def test_the_runner_needs_onnxruntime_and_numpy_alone(exported):
+    code = f"""
+import sys
+sys.path.insert(0, {str(Path(onnx_runner.__file__).parent)!r})
+import numpy, onnxruntime
+before = set(sys.modules)
+import onnx_runner
+policy = onnx_runner.OnnxPolicy({str(exported)!r})
+print(policy.select_action(numpy.zeros(({N_POINTS}, 3)), numpy.zeros({N_STATES})).shape)
+assert not {{"torch", "lerobot", "lerobot_uca"}} & set(sys.modules)
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (0, f"({N_ACTIONS},)\n"), result.stderr
+
+
+def test_an_existing_file_is_replaced_only_when_asked_for(checkpoint, tmp_path):
+    output = tmp_path / "new" / "policy.onnx"
+    export(str(checkpoint), output)
+    with pytest.raises(UserError, match=r"exists\. Choose another --output, or replace it with --overwrite"):
+        export(str(checkpoint), output)
+    export(str(checkpoint), output, overwrite=True)
+    assert [path.name for path in output.parent.iterdir()] == ["policy.onnx"]
+
+
+# Bad input ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_policy_of_another_package(tmp_path):
+    make_policy_config("act", device="cpu", input_features={}, output_features={}).save_pretrained(tmp_path)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        (tmp_path / name).write_text("{}")
+    with pytest.raises(UserError, match=r"Only this package's point-cloud policies can be exported; .* of type 'act'"):
+        export(str(tmp_path), tmp_path / "policy.onnx")
+
+
+@pytest.mark.parametrize("missing", ["config.json", "policy_preprocessor.json", "policy_postprocessor.json"])
+def test_a_checkpoint_without_config_or_processors(tmp_path, missing):
+    save(tmp_path)
+    (tmp_path / missing).unlink()
+    with pytest.raises(UserError, match=re.escape(f"has no {missing}. A checkpoint is a folder like")):
+        export(str(tmp_path), tmp_path / "policy.onnx")
+
+
+def test_a_processor_step_that_a_trace_would_not_hold_for(tmp_path):
+    save(tmp_path)
+    path = tmp_path / "policy_preprocessor.json"
+    pipeline = json.loads(path.read_text())
+    pipeline["steps"].insert(0, {"registry_name": "time_limit_processor", "config": {"max_episode_steps": 3}})
+    path.write_text(json.dumps(pipeline))
+    with pytest.raises(UserError, match="cannot be exported with its processor step 'time_limit_processor'; these can"):
+        export(str(tmp_path), tmp_path / "policy.onnx")
+
+
+@pytest.mark.parametrize("name", ["nowhere/at/all", "no-such-user/no-such-policy"])
+def test_a_checkpoint_that_is_nowhere(tmp_path, name):
+    with pytest.raises(UserError, match=f"'{name}' is no folder and not to be had from the Hub"):
+        export(name, tmp_path / "policy.onnx")
+
+
+def test_a_file_that_cannot_be_written(checkpoint, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="Cannot write"):
+        export(str(checkpoint), tmp_path / "file" / "policy.onnx")
+
+
+def test_nothing_is_written_if_onnxruntime_computes_something_else(checkpoint, tmp_path, monkeypatch):
+    monkeypatch.setattr("lerobot_uca.export.TOLERANCE", 0.0)  # not even rounding
+    with pytest.raises(UserError, match=r"computes other actions than the policy: .* Nothing was written"):
+        export(str(checkpoint), tmp_path / "policy.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_onnxruntime_that_is_too_old(exported, monkeypatch):
+    monkeypatch.setattr(onnxruntime, "__version__", "1.9.0")
+    with pytest.raises(RuntimeError, match=r"onnxruntime must be at least 1\.12, got 1\.9\.0"):
+        OnnxPolicy(exported)
+
+
+@pytest.mark.parametrize(
+    ("point_cloud", "state", "message"),
+    [
+        (np.zeros((5, 3)), np.zeros(N_STATES), r"'point_cloud' must have shape \(32, 3\), got \(5, 3\)"),
+        (np.zeros((N_POINTS, 3)), np.zeros(2), r"'state' must have shape \(9,\), got \(2,\)"),
+        (np.full((N_POINTS, 3), np.nan), np.zeros(N_STATES), "'point_cloud' must be finite"),
+        (np.zeros((N_POINTS, 3)), np.full(N_STATES, np.inf), "'state' must be finite"),
+    ],
+)
+def test_observations_that_do_not_fit(exported, point_cloud, state, message):
+    with pytest.raises(ValueError, match=message):
+        OnnxPolicy(exported).select_action(point_cloud, state)
+
+
+def test_a_file_that_is_no_policy(tmp_path):
+    network = torch.nn.Linear(3, 3)
+    torch.onnx.export(network, torch.zeros(3), str(tmp_path / "other.onnx"), dynamo=False, input_names=["x"])
+    with pytest.raises(ValueError, match=r"must have the inputs point_cloud, state, noise, got x"):
+        OnnxPolicy(tmp_path / "other.onnx")

@@ -1,0 +1,79 @@
+"""ONNX Runtime computes what PyTorch computes, always with the network's present weights."""
+
+import copy
+import pickle
+from operator import call
+
+import pytest
+import torch
+from torch import nn
+
+from lerobot_uca.networks.transformer import UnifiedTransformer
+from lerobot_uca.onnx_runtime import OnnxFunction
+
+
+def make_network(n_out: int = 4) -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 16), nn.LayerNorm(16), nn.GELU(), nn.Linear(16, n_out)).eval()
+
+
+@pytest.mark.parametrize("batch_size", [1, 3, 64])
+def test_a_transformer_gives_the_same_numbers(batch_size):
+    sizes = {"horizon": 4, "n_actions": 4, "n_obs_steps": 2, "n_obs_features": 8, "n_timestep_tokens": 2}
+    network = UnifiedTransformer(**sizes, dim=64, n_layers=3, n_heads=4, n_interval_tokens=2).eval()
+    z, o, ones = torch.randn(batch_size, 4, 4), torch.randn(batch_size, 2, 8), torch.ones(batch_size)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            OnnxFunction(call)(network, z, ones, ones, o), network(z, ones, ones, o), atol=1e-5, rtol=0
+        )
+
+
+def test_one_function_serves_all_shapes():
+    network, function = make_network(), OnnxFunction(call)
+    for shape in ((1, 3), (5, 3), (2, 7, 3), (1, 3)):
+        x = torch.randn(shape)
+        torch.testing.assert_close(function(network, x), network(x).detach(), atol=1e-5, rtol=0)
+    assert len(function._sessions) == 3
+
+
+def test_changed_weights_are_noticed():
+    network, function, x = make_network(), OnnxFunction(call), torch.randn(2, 3)
+    function(network, x)
+    optimizer = torch.optim.SGD(network.parameters(), lr=1.0)
+    network(x).square().sum().backward()
+    other = make_network()
+
+    def load() -> None:
+        network.load_state_dict(other.state_dict())
+
+    def average() -> None:
+        with torch.no_grad():
+            torch._foreach_lerp_(list(network.parameters()), list(make_network().parameters()), 0.5)
+
+    for change in (optimizer.step, load, average):
+        before = function(network, x)
+        change()
+        after = function(network, x)
+        assert not torch.allclose(after, before)
+        torch.testing.assert_close(after, network(x).detach(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(function(other, x), other(x).detach(), atol=1e-5, rtol=0)  # another network
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_tracing_leaves_the_networks_mode_alone(training):
+    network = make_network().train(training)
+    OnnxFunction(call)(network, torch.randn(2, 3))
+    assert all(module.training == training for module in network.modules())
+
+
+def test_tracing_knows_neither_autocast_nor_inference_mode():
+    network, x = make_network(), torch.randn(2, 3)
+    expected = network(x).detach()
+    with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(OnnxFunction(call)(network, x * 1), expected, atol=1e-5, rtol=0)
+    assert all(parameter.requires_grad and not parameter.is_inference() for parameter in network.parameters())
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda function: pickle.loads(pickle.dumps(function))])
+def test_it_can_be_copied_and_sent(duplicate):
+    network, function, x = make_network(), OnnxFunction(call), torch.randn(2, 3)
+    assert torch.equal(duplicate(function)(network, x), function(network, x))
