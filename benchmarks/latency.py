@@ -127,7 +127,7 @@ def draw() -> None:
             positions = np.arange(len(bars)) + 0.4 * i
             axis.bar(positions, median, 0.36, yerr=(median - p10, p90 - median), capsize=2, label=f"{n_points} points")
             for x, value, top in zip(positions, median, p90, strict=True):
-                axis.annotate(f"{value:.3g}", (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
+                axis.annotate(f"{value:.0f}", (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
         axis.set_xticks(np.arange(len(NAMES)) + 0.2, [NAMES[bar["policy"]] for bar in bars], fontsize=8)
         axis.set_yscale("log")
         axis.set_title(f"{n_threads} thread{'s' * (n_threads > 1)}", fontsize=10)

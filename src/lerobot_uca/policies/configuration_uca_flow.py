@@ -31,7 +31,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     n_interval_tokens: int = 4
 
     # How conditions reach the actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
-    # same size to within 10 %).
+    # same size).
     conditioning: str = "unified"
     # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
     dual_pass: bool = True
