@@ -78,7 +78,7 @@ register_third_party_plugins()
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-assert "uca_flow" in PreTrainedConfig.get_known_choices()
+assert {"uca_flow", "dp3", "simple_dp3", "flow", "mp1"} <= set(PreTrainedConfig.get_known_choices())
 assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
 assert hasattr(LeRobotDataset, "__getitems__")
 """

@@ -52,6 +52,8 @@ def guided_target(
 ) -> Tensor:
     """What u(z, t, r) should be: v^ - (t - r) du/dt with the guided velocity v^ = 2 v - u(z, t, t), (B, T, A).
 
+    MP1's paper calls this classifier-free guidance. In its code, and so here, u keeps its condition o.
+
     du/dt is taken along the path that v^ shows, with r fixed: a Jacobian-vector product with the tangent (v^, 1, 0) in
     (z, t, r). The first n_instants samples have r = t and need none.
     """

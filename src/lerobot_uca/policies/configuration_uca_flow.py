@@ -31,7 +31,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     n_interval_tokens: int = 4
 
     # How conditions reach the actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
-    # same size to within 10 %).
+    # same size).
     conditioning: str = "unified"
     # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
     inference: str = "onnxruntime"
