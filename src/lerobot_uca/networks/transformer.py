@@ -72,7 +72,6 @@ class ConditionActionTransformer(nn.Module):
         n_interval_tokens: int,
     ) -> None:
         super().__init__()
-        self.horizon = horizon
         self.embed_observation = nn.Linear(n_obs_features, dim)
         self.embed_timestep = TimeEmbedding(dim)
         self.embed_interval = TimeEmbedding(dim)
@@ -112,4 +111,4 @@ class UnifiedTransformer(ConditionActionTransformer):
         *earlier, last = self.blocks
         for block in earlier:
             tokens = block(tokens, n_out=tokens.shape[1])
-        return last(tokens, n_out=self.horizon)  # what nobody reads is not computed
+        return last(tokens, n_out=Y.shape[1])  # what nobody reads is not computed
