@@ -43,9 +43,24 @@ def _one_thread() -> None:
     torch.manual_seed(0)
 
 
-def make_config(**changes: object) -> UCAFlowConfig:
-    """A UCA-Flow configuration small enough for a test."""
-    settings = {
+TINY_UNET = {"point_widths": (16, 32), "unet_widths": (16, 32), "unet_blocks": 1, "time_dim": 16}
+SMALL_POLICIES: dict[str, dict] = {
+    "uca_flow": {
+        "point_widths": (16, 32),
+        "dim": 32,
+        "n_layers": 2,
+        "n_heads": 2,
+        "n_timestep_tokens": 2,
+        "n_interval_tokens": 2,
+    },
+    **dict.fromkeys(("dp3", "simple_dp3", "flow", "mp1"), TINY_UNET),
+}
+"""Sizes small enough for a test, by policy type."""
+
+
+def make_settings() -> dict:
+    """What every configuration needs besides sizes."""
+    return {
         "input_features": {
             OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (N_POINTS, 3)),
             "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
@@ -53,14 +68,12 @@ def make_config(**changes: object) -> UCAFlowConfig:
         "output_features": {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))},
         "device": "cpu",
         "push_to_hub": False,
-        "dim": 32,
-        "n_layers": 2,
-        "n_heads": 2,
-        "n_timestep_tokens": 2,
-        "n_interval_tokens": 2,
-        "point_widths": (16, 32),
     }
-    return UCAFlowConfig(**{**settings, **changes})
+
+
+def make_config(**changes: object) -> UCAFlowConfig:
+    """A UCA-Flow configuration small enough for a test."""
+    return UCAFlowConfig(**{**make_settings(), **SMALL_POLICIES["uca_flow"], **changes})
 
 
 def make_batch(config: UCAFlowConfig, batch_size: int = 8) -> dict[str, torch.Tensor]:

@@ -14,10 +14,12 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 
 # What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
 ALLOWED = {
-    "policies": {"meanflow", "networks", "errors", "features"},
+    "policies": {"meanflow", "objectives", "networks", "errors", "features"},
+    "objectives": {"meanflow", "networks"},
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
+    "training": {"data", "policies", "errors"},
     "commands": {"data"},
 }
 

@@ -12,6 +12,7 @@ from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_confi
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
@@ -164,6 +165,17 @@ def test_overfitting_one_batch_drives_the_one_step_error_down(dual_pass):
     assert error() < 0.2 * before
 
 
+@pytest.mark.parametrize("conditioning", ["cross_attention", "adaln"])
+def test_a_checkpoint_remembers_which_ablation_it_is(conditioning, tmp_path):
+    policy = UCAFlowPolicy(make_config(conditioning=conditioning, dual_pass=False)).eval()
+    policy.save_pretrained(tmp_path)
+    loaded = UCAFlowPolicy.from_pretrained(tmp_path)
+    assert (loaded.config.conditioning, loaded.config.dual_pass) == (conditioning, False)
+    assert type(loaded.model.generator) is CONDITIONING[conditioning]
+    noise, observation = torch.randn(2, T, N_ACTIONS), make_observation(2)
+    assert torch.equal(loaded.select_action(observation, noise=noise), policy.select_action(observation, noise=noise))
+
+
 def test_averaged_weights_follow_the_stated_schedule():
     policy = UCAFlowPolicy(make_config())
     weight = policy.model.generator.embed_action.weight
@@ -237,6 +249,10 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
         ({"dtype": "float16"}, "policy.dtype must be float32 or bfloat16, got 'float16'"),
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
         ({"n_layers": 0}, "policy.n_layers must be at least 1, got 0"),
+        (
+            {"conditioning": "film"},
+            "policy.conditioning must be one of unified, cross_attention, adaln, got 'film'",
+        ),
     ],
 )
 def test_wrong_settings(changes, message):
