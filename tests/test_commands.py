@@ -133,7 +133,7 @@ def test_help_lists_and_teaches():
         assert taught in " ".join(scoped.split())
     assert "def " not in scoped
     collect = succeed("lerobot-uca-collect", "--help")
-    for option in ("--repo_id", "--n_episodes", "--overwrite", "--push_to_hub", "--seed"):
+    for option in ("--repo_id", "--n_episodes", "--overwrite", "--push_to_hub", "--seed", "--expert"):
         assert option in collect
 
 
@@ -149,6 +149,16 @@ def test_an_unknown_task(tmp_path):
         f"--root={tmp_path}/d",
     )
     assert line.startswith("error: Unknown task 'hamer'. Meta-World tasks: hammer, ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_adroit_without_an_expert(tmp_path):
+    adroit = ("--env.type=adroit_pointcloud", "--env.task=door", "--repo_id=a/b", f"--root={tmp_path}/d")
+    assert fail("lerobot-uca-collect", *adroit).startswith(
+        "error: Adroit has no expert built in. Give one with --expert"
+    )
+    line = fail("lerobot-uca-collect", *adroit, "--expert=none.npz")
+    assert line == "error: Cannot read the expert's weights: [Errno 2] No such file or directory: 'none.npz'"
     assert list(tmp_path.iterdir()) == []
 
 
