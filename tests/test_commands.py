@@ -142,7 +142,7 @@ def test_help_lists_and_teaches():
         assert taught in " ".join(scoped.split())
     assert "def " not in scoped
     collect = succeed("lerobot-uca-collect", "--help")
-    for option in ("--repo_id", "--n_episodes", "--overwrite", "--push_to_hub", "--seed"):
+    for option in ("--repo_id", "--n_episodes", "--overwrite", "--push_to_hub", "--seed", "--expert"):
         assert option in collect
 
 
@@ -163,6 +163,16 @@ def test_an_unknown_task(tmp_path):
 
 def test_exporting_what_is_no_checkpoint(tmp_path):
     assert "has no config.json. A checkpoint is a folder like" in fail("lerobot-uca-export", tmp_path)
+
+
+def test_adroit_without_an_expert(tmp_path):
+    adroit = ("--env.type=adroit_pointcloud", "--env.task=door", "--repo_id=a/b", f"--root={tmp_path}/d")
+    assert fail("lerobot-uca-collect", *adroit).startswith(
+        "error: Adroit has no expert built in. Give one with --expert"
+    )
+    line = fail("lerobot-uca-collect", *adroit, "--expert=none.npz")
+    assert line == "error: Cannot read the expert's weights: [Errno 2] No such file or directory: 'none.npz'"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_training_finds_an_unknown_task_before_its_first_step(dataset_root, tmp_path):

@@ -2,6 +2,7 @@ import dataclasses
 import gc
 import re
 import shutil
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from lerobot.envs import make_env_config
 from lerobot_uca.data import collect as collecting
 from lerobot_uca.data.collect import CollectConfig, collect
 from lerobot_uca.data.demonstrations import Demonstration, demonstrate
-from lerobot_uca.envs.configs import MetaworldPointCloudConfig
+from lerobot_uca.envs.adroit import HAND
+from lerobot_uca.envs.configs import AdroitPointCloudConfig, MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -139,6 +141,24 @@ def test_an_overwrite_that_cannot_finish_brings_the_old_folder_back(tmp_path, mo
 def test_a_name_that_is_too_long(tmp_path):
     with pytest.raises(UserError, match="Cannot write"):
         collect(config(tmp_path / ("x" * 300)))
+
+
+def test_an_adroit_dataset_holds_the_successful_episodes_alone(adroit_experts, tmp_path):
+    env = AdroitPointCloudConfig(task="pen", n_points=16)
+    expert = str(adroit_experts / "{task}.npz")
+    dataset = collect(config(tmp_path / "pen", env=env, expert=expert, seed=1))  # of seeds 1 and 2, 1 fails
+    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (1, 50, 50)
+    assert dataset.features["action"]["names"] == dataset.features["observation.state"]["names"] == list(HAND)
+    failed, kept = (
+        demonstrate(env.env_factory("pen"), attempt) for attempt in islice(env.attempts("pen", expert, first_seed=1), 2)
+    )
+    assert (failed.is_successful, kept.is_successful) == (False, True)
+    np.testing.assert_array_equal(np.stack([dataset[index]["action"] for index in range(50)]), kept.action)
+
+
+def test_meta_world_takes_no_expert(tmp_path):
+    with pytest.raises(UserError, match=r"Meta-World's experts are built in\. Leave --expert out, got 'door\.npz'"):
+        collect(config(tmp_path / "new", expert="door.npz"))
 
 
 def test_wrong_settings(tmp_path):

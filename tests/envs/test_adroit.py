@@ -8,7 +8,7 @@ from lerobot.envs import make_env, make_env_config, preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_uca.envs import adroit
-from lerobot_uca.envs.adroit import ARM, HAND, TASKS, AdroitPointCloudEnv, make_simulator
+from lerobot_uca.envs.adroit import ARM, HAND, TASKS, AdroitPointCloudEnv, Outcome, make_simulator
 from lerobot_uca.envs.dapg import DAPGExpert, DAPGWeights
 from lerobot_uca.envs.point_cloud import Crop
 from lerobot_uca.errors import UserError
@@ -204,26 +204,26 @@ def observation_of(task: str, **values: object) -> np.ndarray:
 @pytest.mark.parametrize(("hinge", "reached"), [(1.39, False), (1.41, True)])
 def test_a_door_is_open_beyond_its_threshold(hinge, reached):
     observation = observation_of("door", hinge=hinge)
-    assert adroit.judge_final(TASKS["door"], observation, not reached, True).is_success == reached
-    assert not adroit.judge_final(TASKS["door"], observation, True, False).is_success  # the time is not over
+    assert adroit.judge_final(TASKS["door"], Outcome(observation, not reached, True)).is_success == reached
+    assert not adroit.judge_final(TASKS["door"], Outcome(observation, True, False)).is_success  # the time is not over
 
 
 @pytest.mark.parametrize(("angle", "reached"), [(17, True), (19, False)])  # cos 18.2 deg = 0.95
 def test_a_pen_points_the_right_way_within_18_degrees(angle, reached):
     axis = [np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0]
     observation = observation_of("pen", axis=axis, desired=[1, 0, 0], height=0.2)
-    assert adroit.judge_final(TASKS["pen"], observation, False, True) == (False, reached)
+    assert adroit.judge_final(TASKS["pen"], Outcome(observation, False, True)) == (False, reached)
 
 
 def test_a_dropped_pen_ends_the_episode_without_success():
     observation = observation_of("pen", axis=[1, 0, 0], desired=[1, 0, 0], height=0.07)
     for is_last in (False, True):
-        assert adroit.judge_final(TASKS["pen"], observation, True, is_last) == (True, False)
+        assert adroit.judge_final(TASKS["pen"], Outcome(observation, True, is_last)) == (True, False)
 
 
 def test_any_success_is_the_simulators_own_and_ends_the_episode():
     for word in (False, True):
-        assert adroit.judge_any(TASKS["pen"], observation_of("pen"), word, False) == (word, word)
+        assert adroit.judge_any(TASKS["pen"], Outcome(observation_of("pen"), word, False)) == (word, word)
 
 
 def test_the_goals_look_where_the_simulator_writes():

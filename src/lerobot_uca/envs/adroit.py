@@ -32,6 +32,17 @@ TILTED = ((1.0, 0.0, 0.0), (0.0, _C, -_C), (0.0, _C, _C))  # 45 deg about x: for
 PICTURE_CAMERA = Camera("vil_camera", (0.0, -1.2, 1.2), TILTED, fovy=45.0, width=160, height=160)
 
 
+class Outcome(NamedTuple):
+    """What an action has led to, as the simulator tells it."""
+
+    observation: Array
+    """The simulator's own."""
+    is_reached: bool
+    """Whether the simulator calls the goal reached."""
+    is_last: bool
+    """Whether the episode's time is over."""
+
+
 class Task(NamedTuple):
     """What one task has of its own.
 
@@ -40,9 +51,8 @@ class Task(NamedTuple):
         simulator: the class in gymnasium-robotics.
         arm: the arm's joints, in the order of its actions.
         camera, crop: what the cloud is seen with, and what belongs to it.
-        papers_goal: whether the papers' environment says that the goal is reached, from the simulator's own
-            observation and its own word on success.
-        failed: whether the papers' environment ends the episode, from the simulator's own observation.
+        papers_goal: whether the papers' environment calls the goal reached.
+        papers_end: whether the papers' environment ends the episode before its time.
         episode_length: in actions.
     """
 
@@ -51,8 +61,8 @@ class Task(NamedTuple):
     arm: tuple[str, ...]
     camera: Camera
     crop: Crop
-    papers_goal: Callable[[Array, bool], bool] = lambda _, simulators_word: simulators_word
-    failed: Callable[[Array], bool] = lambda _: False
+    papers_goal: Callable[[Outcome], bool] = lambda outcome: outcome.is_reached
+    papers_end: Callable[[Outcome], bool] = lambda _: False
     episode_length: int = 100
 
     @property
@@ -67,7 +77,8 @@ def top(height: float, pixels: int) -> Camera:
 
 
 # The baselines cast 84 x 84 rays and fill up with zeros where too few points are left of a hammer or a pen. More rays
-# are cast here: as many as give 1024 different points.
+# are cast here: as many as give 1024 different points. The crops hold what hand and objects reach in the experts'
+# episodes, with a margin, without the table (its top is at z = 0) and most of the forearm.
 TASKS = {
     "hammer": Task(
         "pick up the hammer and drive the nail into the board",
@@ -82,7 +93,7 @@ TASKS = {
         ARM[2:],
         top(1.5, 96),
         Crop((-0.25, -0.65, 0.005), (0.6, 0.52, 0.65)),
-        papers_goal=lambda observation, _: bool(observation[28] > 1.4),  # hinge [rad]
+        papers_goal=lambda outcome: bool(outcome.observation[28] > 1.4),  # hinge [rad]
     ),
     "pen": Task(
         "turn the pen in the hand until it points where the other pen points",
@@ -90,8 +101,9 @@ TASKS = {
         (),
         Camera("tilted", (0.0, -0.8, 0.8), TILTED, fovy=45.0, width=192, height=192),
         Crop((-0.17, -0.34, 0.05), (0.28, -0.04, 0.4)),
-        papers_goal=lambda observation, _: bool(observation[33:36] @ observation[36:39] > 0.95),  # axes of both pens
-        failed=lambda observation: bool(observation[26] < 0.075),  # height of the pen [m]: it was dropped
+        # cosine of the angle between the axes of both pens
+        papers_goal=lambda outcome: bool(outcome.observation[33:36] @ outcome.observation[36:39] > 0.95),
+        papers_end=lambda outcome: bool(outcome.observation[26] < 0.075),  # height of the pen [m]: it was dropped
         episode_length=50,
     ),
     "relocate": Task(
@@ -115,27 +127,38 @@ def resolve(spec: str | None) -> dict[str, tuple[str, ...]]:
 
 
 class Verdict(NamedTuple):
-    """What an action has led to."""
+    """What an environment reports of an outcome."""
 
     terminated: bool
     is_success: bool
 
 
-def judge_final(task: Task, observation: Array, simulators_word: bool, is_last: bool) -> Verdict:
+def judge_final(task: Task, outcome: Outcome) -> Verdict:
     """The papers' success: the goal is reached when the episode's time is over.
 
     Their code also counts a pen that points the right way in the very step in which it falls; here it does not.
     """
-    failed = task.failed(observation)
-    return Verdict(failed, is_last and not failed and task.papers_goal(observation, simulators_word))
+    failed = task.papers_end(outcome)
+    return Verdict(failed, outcome.is_last and not failed and task.papers_goal(outcome))
 
 
-def judge_any(_: Task, __: Array, simulators_word: bool, ___: bool) -> Verdict:
+def judge_any(_: Task, outcome: Outcome) -> Verdict:
     """gymnasium-robotics' success: the goal is reached after any action."""
-    return Verdict(simulators_word, simulators_word)
+    return Verdict(outcome.is_reached, outcome.is_reached)
 
 
 SUCCESS = {"final": judge_final, "any": judge_any}
+
+
+def judge_of(success: str) -> Callable[[Task, Outcome], Verdict]:
+    """What decides about success, by its name in `SUCCESS`.
+
+    Raises:
+        UserError: for another name.
+    """
+    if success not in SUCCESS:
+        raise UserError(f"env.success must be one of {', '.join(SUCCESS)}, got '{success}'.")
+    return SUCCESS[success]
 
 
 class AdroitPointCloudEnv(PointCloudEnv):
@@ -175,7 +198,7 @@ class AdroitPointCloudEnv(PointCloudEnv):
             picture_camera=PICTURE_CAMERA,
         )
         self._own_joints = [joints.index(joint) for joint in self._task.joints]
-        self._judge = SUCCESS[success]
+        self._judge = judge_of(success)
         self._max_episode_steps = self._task.episode_length  # LeRobot reads it
 
     def reset(
@@ -208,7 +231,7 @@ class AdroitPointCloudEnv(PointCloudEnv):
         mujoco.mj_kinematics(simulator.model, simulator.data)
         self._n_steps += 1
         truncated = self._n_steps >= self._max_episode_steps
-        verdict = self._judge(self._task, self.expert_observation, bool(info["success"]), truncated)
+        verdict = self._judge(self._task, Outcome(self.expert_observation, bool(info["success"]), truncated))
         return self._observe(), float(rewards), verdict.terminated, truncated, {"is_success": verdict.is_success}
 
     def from_own(self, action: Array) -> NDArray[np.float32]:

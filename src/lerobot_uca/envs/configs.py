@@ -154,8 +154,7 @@ class AdroitPointCloudConfig(PointCloudEnvConfig):
     @override
     def validate(self) -> None:
         super().validate()
-        if self.success not in adroit.SUCCESS:
-            raise UserError(f"env.success must be one of {', '.join(adroit.SUCCESS)}, got '{self.success}'.")
+        adroit.judge_of(self.success)
 
     @override
     def tasks(self) -> dict[str, tuple[str, ...]]:
