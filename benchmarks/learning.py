@@ -45,19 +45,20 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2], help="seeds of training")
     parser.add_argument("--n_episodes", type=int, default=50)
     parser.add_argument("--first_eval_seed", type=int, default=1000, help="seed of the first evaluation episode")
-    parser.add_argument("arguments", nargs="*", help="for lerobot-train")
-    args = parser.parse_args()
+    end = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    args = parser.parse_args(sys.argv[1:end])
+    for_training = sys.argv[end + 1 :]
     logging.disable(logging.INFO)
     dataset = collect(args.env, args.task, args.expert)
     for seed in args.seeds:
         values = (args.name, args.task, args.steps, seed, args.first_eval_seed, args.n_episodes)
-        row = dict(zip(IDENTITY, (*map(str, values), " ".join([args.config, *args.arguments])), strict=True))
+        row = dict(zip(IDENTITY, (*map(str, values), " ".join([args.config, *for_training])), strict=True))
         if any(row.items() <= known.items() for known in read(args.results)):
             print("there:", row)
             continue
         training = OUTPUT / f"{args.task}-{args.name}-{args.steps}-{seed}"
         start = time.monotonic()
-        checkpoint = train(args.config, dataset, training, [f"--steps={args.steps}", f"--seed={seed}", *args.arguments])
+        checkpoint = train(args.config, dataset, training, [f"--steps={args.steps}", f"--seed={seed}", *for_training])
         trained = time.monotonic()
         env_config = EnvConfig.get_choice_class(args.env)(task=args.task)
         success = evaluate(checkpoint, env_config, args.n_episodes, args.first_eval_seed)
