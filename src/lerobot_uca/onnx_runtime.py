@@ -38,10 +38,10 @@ class OnnxFunction:
 
     def __call__(self, network: nn.Module, *inputs: Tensor) -> Tensor:
         """The same as `eager(network, *inputs)` up to rounding. Inputs are float32 and on the CPU."""
-        if network is not self._network or self._versions != [weight._version for weight in self._weights]:
+        if network is not self._network or self._versions != _versions(self._weights):
             self._network = network
             self._weights = [*network.parameters(), *network.buffers()]
-            self._versions = [weight._version for weight in self._weights]
+            self._versions = _versions(self._weights)
             self._sessions.clear()
         shapes = tuple(tensor.shape for tensor in inputs)
         if shapes not in self._sessions:
@@ -50,6 +50,11 @@ class OnnxFunction:
         session = self._sessions[shapes]
         feeds = {argument.name: tensor.numpy() for argument, tensor in zip(session.get_inputs(), inputs, strict=True)}
         return torch.from_numpy(session.run(None, feeds)[0])
+
+
+def _versions(weights: Sequence[Tensor]) -> list[int]:
+    """What grows when weights are changed. Those made in inference mode do not count; nothing trains them."""
+    return [0 if weight.is_inference() else weight._version for weight in weights]
 
 
 def to_onnx(
