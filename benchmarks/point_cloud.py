@@ -1,6 +1,6 @@
-"""Milliseconds of each stage from simulator to observation, and of the picture: medians over an episode's steps.
+"""Milliseconds of an environment's step, of the stages of its observation, and of the picture: medians of an episode.
 
-python benchmarks/point_cloud.py
+python benchmarks/point_cloud.py --expert='../shared/adroit_experts/{task}.npz'
 """
 
 import argparse
@@ -9,43 +9,57 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from lerobot.envs import make_env_config
 
-from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv, ScriptedExpert
+import lerobot_policy_uca_flow  # noqa: F401  (registers the environments)
+from lerobot_uca.envs.configs import PointCloudEnvConfig
+from lerobot_uca.envs.expert import Expert
 from lerobot_uca.envs.point_cloud import sample_farthest
 
-TASKS = ("drawer-close", "dial-turn", "shelf-place", "hand-insert", "hammer")
+TASKS = {
+    "metaworld_pointcloud": ("drawer-close", "dial-turn", "shelf-place", "hand-insert", "hammer"),
+    "adroit_pointcloud": ("hammer", "door", "pen", "relocate"),
+}
+STAGES = ("step", "rays + crop", "sample", "observation", "picture", "fewest points")
 
 
 def main() -> None:
     """Print one row a task."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=100, help="steps of the expert's episode to measure")
-    n_steps = parser.parse_args().steps
-    stages = ("simulate", "rays + crop", "sample 512", "observation", "picture")
-    print(f"{'ms, median':16}" + "".join(f"{name:>13}" for name in (*stages, "points")))
-    for task in TASKS:
-        rows = measure(task, n_steps)
-        print(
-            f"{task:16}"
-            + "".join(f"{value:13.2f}" for value in np.median(rows[:, :-1], axis=0))
-            + f"{rows[:, -1].mean():13.0f}"
-        )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=100, help="steps of the episode to measure")
+    parser.add_argument("--expert", help="who acts in Adroit, as for lerobot-uca-collect; random actions by default")
+    args = parser.parse_args()
+    print(f"{'ms, median':34}" + "".join(f"{name:>14}" for name in STAGES))
+    for kind, tasks in TASKS.items():
+        for task in tasks:
+            config = make_env_config(kind, task=task)
+            rows = measure(config, task, expert_of(config, task, args.expert), args.steps)
+            times, n_points = np.median(rows[:, :-1], axis=0), rows[:, -1].min()
+            name = f"{kind.removesuffix('_pointcloud')} {task}, {config.n_points} points"
+            print(f"{name:34}" + "".join(f"{value:14.2f}" for value in times) + f"{n_points:14.0f}")
 
 
-def measure(task: str, n_steps: int) -> np.ndarray:
+def expert_of(config: PointCloudEnvConfig, task: str, adroits: str | None) -> Expert:
+    """Meta-World's own, the given one for Adroit, or one that acts at random."""
+    if config.type == "adroit_pointcloud" and adroits is None:
+        return lambda env: env.action_space.sample()
+    return next(config.attempts(task, adroits if config.type == "adroit_pointcloud" else None, 0)).expert()
+
+
+def measure(config: PointCloudEnvConfig, task: str, expert: Expert, n_steps: int) -> np.ndarray:
     """Times [ms] of the stages and the number of points inside the crop, (steps, 6)."""
-    env, expert = MetaworldPointCloudEnv(task), ScriptedExpert(task)
+    env = config.env_factory(task)()
+    env.action_space.seed(0)
     env.reset(seed=0)
-    simulator, camera = env._simulator, env._cloud_camera
     rows = []
     for _ in range(n_steps):
-        action = expert(env)
-        simulate, (env.expert_observation, *_) = timed(simulator.step, action)
-        rays, points = timed(camera.capture, simulator.model, simulator.data, env._markers())
+        step, _ = timed(env.step, expert(env))
+        simulator = env._simulator
+        rays, points = timed(env._cloud_camera.capture, simulator.model, simulator.data, env._markers())
         sample, _ = timed(sample_farthest, points, env.n_points)
         observe, _ = timed(env._observe)
         picture, _ = timed(env.render)
-        rows.append([simulate, rays, sample, observe, picture, len(points)])
+        rows.append([step, rays, sample, observe, picture, len(points)])
     return np.array(rows)
 
 

@@ -18,6 +18,23 @@ from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 N_POINTS, N_STATES, N_ACTIONS = 32, 9, 4
+ADROIT_EXPERTS = Path(__file__).parents[2] / "shared" / "adroit_experts"
+"""Weights are data, not code: they lie beside the project."""
+
+
+@pytest.fixture(scope="session")
+def adroit_experts() -> Path:
+    """Folder of the trained policies, {task}.npz."""
+    if not ADROIT_EXPERTS.is_dir():
+        pytest.skip(f"there are no Adroit experts in {ADROIT_EXPERTS}")
+    return ADROIT_EXPERTS
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Skipped tests are easily overlooked."""
+    if not ADROIT_EXPERTS.is_dir():
+        line = f"NOT TESTED: Adroit's demonstrations, because there are no expert weights in {ADROIT_EXPERTS}"
+        terminalreporter.write_line(line, red=True, bold=True)
 
 
 @pytest.fixture(autouse=True)
@@ -26,9 +43,24 @@ def _one_thread() -> None:
     torch.manual_seed(0)
 
 
-def make_config(**changes: object) -> UCAFlowConfig:
-    """A UCA-Flow configuration small enough for a test."""
-    settings = {
+TINY_UNET = {"point_widths": (16, 32), "unet_widths": (16, 32), "unet_blocks": 1, "time_dim": 16}
+SMALL_POLICIES: dict[str, dict] = {
+    "uca_flow": {
+        "point_widths": (16, 32),
+        "dim": 32,
+        "n_layers": 2,
+        "n_heads": 2,
+        "n_timestep_tokens": 2,
+        "n_interval_tokens": 2,
+    },
+    **dict.fromkeys(("dp3", "simple_dp3", "flow", "mp1"), TINY_UNET),
+}
+"""Sizes small enough for a test, by policy type."""
+
+
+def make_settings() -> dict:
+    """What every configuration needs besides sizes."""
+    return {
         "input_features": {
             OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (N_POINTS, 3)),
             "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
@@ -36,14 +68,12 @@ def make_config(**changes: object) -> UCAFlowConfig:
         "output_features": {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))},
         "device": "cpu",
         "push_to_hub": False,
-        "dim": 32,
-        "n_layers": 2,
-        "n_heads": 2,
-        "n_timestep_tokens": 2,
-        "n_interval_tokens": 2,
-        "point_widths": (16, 32),
     }
-    return UCAFlowConfig(**{**settings, **changes})
+
+
+def make_config(**changes: object) -> UCAFlowConfig:
+    """A UCA-Flow configuration small enough for a test."""
+    return UCAFlowConfig(**{**make_settings(), **SMALL_POLICIES["uca_flow"], **changes})
 
 
 def make_batch(config: UCAFlowConfig, batch_size: int = 8) -> dict[str, torch.Tensor]:

@@ -13,11 +13,13 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
+from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 
+from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.onnx_runner import OnnxPolicy
-from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, write_dataset
+from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, TINY_UNET, write_dataset
 
 BIN = Path(sys.executable).parent
 ENVIRONMENT = ["--env.type=metaworld_pointcloud", "--env.task=drawer-close", f"--env.n_points={N_POINTS}"]
@@ -140,7 +142,7 @@ def test_help_lists_and_teaches():
         assert taught in " ".join(scoped.split())
     assert "def " not in scoped
     collect = succeed("lerobot-uca-collect", "--help")
-    for option in ("--repo_id", "--n_episodes", "--overwrite", "--push_to_hub", "--seed"):
+    for option in ("--repo_id", "--n_episodes", "--overwrite", "--push_to_hub", "--seed", "--expert"):
         assert option in collect
 
 
@@ -161,6 +163,16 @@ def test_an_unknown_task(tmp_path):
 
 def test_exporting_what_is_no_checkpoint(tmp_path):
     assert "has no config.json. A checkpoint is a folder like" in fail("lerobot-uca-export", tmp_path)
+
+
+def test_adroit_without_an_expert(tmp_path):
+    adroit = ("--env.type=adroit_pointcloud", "--env.task=door", "--repo_id=a/b", f"--root={tmp_path}/d")
+    assert fail("lerobot-uca-collect", *adroit).startswith(
+        "error: Adroit has no expert built in. Give one with --expert"
+    )
+    line = fail("lerobot-uca-collect", *adroit, "--expert=none.npz")
+    assert line == "error: Cannot read the expert's weights: [Errno 2] No such file or directory: 'none.npz'"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_training_finds_an_unknown_task_before_its_first_step(dataset_root, tmp_path):
@@ -226,3 +238,22 @@ def test_collected_data_opens_as_any_lerobot_dataset(trained):
     dataset = LeRobotDataset("test/data", root=trained / "data")
     assert dataset.num_episodes == 1
     assert dataset[0][OBS_POINT_CLOUD].shape == (N_POINTS, 3)
+
+
+@pytest.mark.parametrize("name", ["dp3", "simple_dp3", "flow", "mp1"])
+def test_baselines_are_trained_and_evaluated_by_the_same_commands(name, dataset_root, tmp_path, monkeypatch):
+    """In this process, which has imported everything, and in episodes of 5 steps."""
+    monkeypatch.setattr(MetaworldPointCloudEnv, "_max_episode_steps", 5)
+    sizes = [f"--policy.{key}={list(size) if isinstance(size, tuple) else size}" for key, size in TINY_UNET.items()]
+    common = ["--policy.device=cpu", *ENVIRONMENT, "--eval.n_episodes=1", "--eval.use_async_envs=false"]
+    policy = [f"--policy.type={name}", "--policy.push_to_hub=false", *sizes]
+    data = ["--dataset.repo_id=test/data", f"--dataset.root={dataset_root}", "--batch_size=4", "--num_workers=0"]
+    steps = ["--steps=2", "--env_eval_freq=2", f"--output_dir={tmp_path}/training"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *common, *policy, *data, *steps])
+    lerobot_train.main()
+    checkpoint = tmp_path / "training" / "checkpoints" / "last" / "pretrained_model"
+    assert PreTrainedConfig.from_pretrained(checkpoint).type == name
+    arguments = [f"--policy.path={checkpoint}", *common, f"--output_dir={tmp_path}/evaluation"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", *arguments])
+    lerobot_eval.main()
+    assert json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1

@@ -14,10 +14,12 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 
 # What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
 ALLOWED = {
-    "policies": {"meanflow", "networks", "onnx_runtime", "errors", "features"},
+    "policies": {"meanflow", "objectives", "networks", "onnx_runtime", "errors", "features"},
+    "objectives": {"meanflow", "networks"},
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
+    "training": {"data", "policies", "errors"},
     "export": {"policies", "onnx_runtime", "errors", "features"},
     "commands": {"data", "export"},
 }
@@ -76,8 +78,8 @@ register_third_party_plugins()
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-assert "uca_flow" in PreTrainedConfig.get_known_choices()
-assert "metaworld_pointcloud" in EnvConfig.get_known_choices()
+assert {"uca_flow", "dp3", "simple_dp3", "flow", "mp1"} <= set(PreTrainedConfig.get_known_choices())
+assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
 assert hasattr(LeRobotDataset, "__getitems__")
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 VelocityNetwork = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 """u(z, t, h, o): z (B, T, A), t (B,), h (B,), o (B, ...) to (B, T, A)."""
@@ -102,6 +101,7 @@ def dual_pass(
     else:
         u, v, tangent = u_fn(*batch), None, target[n:]
     ones = torch.ones_like(t[n:])
+    forward_ad = torch.autograd.forward_ad
     with torch.no_grad(), forward_ad.dual_level():
         z_n, t_n, h_n = map(forward_ad.make_dual, (z[n:], t[n:], h[n:]), (tangent.to(z.dtype), ones, ones))
         D_t_u = forward_ad.unpack_dual(u_fn(z_n, t_n, h_n, o[n:])).tangent

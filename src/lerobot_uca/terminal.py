@@ -1,14 +1,9 @@
 """What LeRobot's commands show of this package in a terminal: one line for a user's mistake, no foreign noise."""
 
 import errno
-import functools
 import logging
-import os
 import sys
-from pathlib import Path
 from types import TracebackType
-
-from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_uca.errors import UserError
 
@@ -37,21 +32,3 @@ def quiet_video_decoder() -> None:
     logging.getLogger("lerobot.utils.import_utils").addFilter(
         lambda record: "'torchcodec' is installed but cannot be loaded" not in record.getMessage()
     )
-
-
-def check_output_folder_before_training() -> None:
-    """Let `lerobot-train` refuse a folder it cannot write before it trains; it would fail at the first checkpoint."""
-    validate = TrainPipelineConfig.validate
-
-    @functools.wraps(validate)
-    def validate_and_check(self: TrainPipelineConfig) -> None:
-        validate(self)
-        if self.job.is_remote:  # the folder is on another machine
-            return
-        parent = Path(self.output_dir).absolute()
-        while not os.path.lexists(parent):
-            parent = parent.parent
-        if not (parent.is_dir() and os.access(parent, os.W_OK | os.X_OK)):
-            raise UserError(f"output_dir '{self.output_dir}' cannot be written: '{parent}' is not a writable folder.")
-
-    TrainPipelineConfig.validate = validate_and_check

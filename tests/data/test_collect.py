@@ -2,6 +2,7 @@ import dataclasses
 import gc
 import re
 import shutil
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from lerobot.envs import make_env_config
 
 from lerobot_uca.data import collect as collecting
 from lerobot_uca.data.collect import CollectConfig, collect
-from lerobot_uca.data.demonstrations import MIN_SUCCESSFUL_STEPS, Demonstration, demonstrate
-from lerobot_uca.envs.configs import MetaworldPointCloudConfig
+from lerobot_uca.data.demonstrations import Demonstration, demonstrate
+from lerobot_uca.envs.adroit import HAND
+from lerobot_uca.envs.configs import AdroitPointCloudConfig, MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -33,13 +35,14 @@ def test_a_dataset_holds_whole_episodes_as_executed(collected):
     assert (collected.num_episodes, collected.num_frames, collected.fps) == (1, 200, 80)
     assert set(collected.features) >= {OBS_POINT_CLOUD, "observation.state", "action"}
     env = collected_env()
-    episode = demonstrate(env.env_factory("drawer-close"), env.expert_factory("drawer-close"), collecting.FIRST_SEED)
+    attempt = next(env.attempts("drawer-close", None, collecting.FIRST_SEED))
+    episode = demonstrate(env.env_factory("drawer-close"), attempt)
     frames = [collected[index] for index in range(200)]
     np.testing.assert_array_equal(np.stack([frame[OBS_POINT_CLOUD] for frame in frames]), episode.point_cloud)
     np.testing.assert_array_equal(np.stack([frame["observation.state"] for frame in frames]), episode.state)
     np.testing.assert_array_equal(np.stack([frame["action"] for frame in frames]), episode.action)
     assert np.abs(episode.action).max() == 1  # the expert asks for more; what is written is what was done
-    assert episode.success.sum() >= MIN_SUCCESSFUL_STEPS
+    assert episode.is_successful
     assert frames[0]["task"] == env.task_description("drawer-close")
 
 
@@ -101,8 +104,8 @@ def test_an_overwrite_that_dies_keeps_the_old_dataset(collected, tmp_path):
 
 
 def test_an_expert_that_fails_is_reported(tmp_path, monkeypatch):
-    failed = Demonstration(*(np.zeros((3, 1)) for _ in range(3)), success=np.zeros(3, dtype=bool))
-    monkeypatch.setattr(collecting, "demonstrations", lambda *_, **__: iter([failed] * 1000))
+    failed = Demonstration(*(np.zeros((3, 1)) for _ in range(3)), is_successful=False)
+    monkeypatch.setattr(collecting, "demonstrations", lambda env, attempts, **_: (failed for _ in attempts))
     with pytest.raises(UserError, match="The expert of 'drawer-close' succeeded in 0 of 20 episodes, 1 are wanted"):
         collect(config(tmp_path / "drawer"))
     assert list(tmp_path.iterdir()) == []
@@ -121,12 +124,10 @@ def test_seeds_of_demonstrations_and_evaluation_are_apart(pipeline):
     assert first_evaluation + 100_000 <= collecting.FIRST_SEED
 
 
-def test_groups_that_overlap_give_each_task_once(tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(collecting, "_collect_task", lambda dataset, env, task, *_: asked.append(task))
+def test_groups_that_overlap_give_each_task_once(tmp_path):
     env = MetaworldPointCloudConfig(task="hard,assembly,push,dial-turn", n_points=16)
-    collecting._write(config(tmp_path / "x", env=env), env, tmp_path / "data")
-    assert len(asked) == len(set(asked)) == 7
+    attempts = collecting._attempts(config(tmp_path / "x", env=env), env)
+    assert list(attempts) == [*env.tasks()["hard"], "dial-turn"]
 
 
 def test_an_overwrite_that_cannot_finish_brings_the_old_folder_back(tmp_path, monkeypatch):
@@ -140,6 +141,24 @@ def test_an_overwrite_that_cannot_finish_brings_the_old_folder_back(tmp_path, mo
 def test_a_name_that_is_too_long(tmp_path):
     with pytest.raises(UserError, match="Cannot write"):
         collect(config(tmp_path / ("x" * 300)))
+
+
+def test_an_adroit_dataset_holds_the_successful_episodes_alone(adroit_experts, tmp_path):
+    env = AdroitPointCloudConfig(task="pen", n_points=16)
+    expert = str(adroit_experts / "{task}.npz")
+    dataset = collect(config(tmp_path / "pen", env=env, expert=expert, seed=1))  # of seeds 1 and 2, 1 fails
+    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (1, 50, 50)
+    assert dataset.features["action"]["names"] == dataset.features["observation.state"]["names"] == list(HAND)
+    failed, kept = (
+        demonstrate(env.env_factory("pen"), attempt) for attempt in islice(env.attempts("pen", expert, first_seed=1), 2)
+    )
+    assert (failed.is_successful, kept.is_successful) == (False, True)
+    np.testing.assert_array_equal(np.stack([dataset[index]["action"] for index in range(50)]), kept.action)
+
+
+def test_meta_world_takes_no_expert(tmp_path):
+    with pytest.raises(UserError, match=r"Meta-World's experts are built in\. Leave --expert out, got 'door\.npz'"):
+        collect(config(tmp_path / "new", expert="door.npz"))
 
 
 def test_wrong_settings(tmp_path):

@@ -206,7 +206,7 @@ def test_no_task(task):
 def test_an_environment_of_a_task_that_is_none():
     with pytest.raises(UserError, match="Unknown task 'foo'"):
         MetaworldPointCloudEnv("foo")
-    with pytest.raises(UserError, match="An environment has one task, got the group 'hard'"):
+    with pytest.raises(UserError, match="An environment has one task, got 'hard'"):
         MetaworldPointCloudEnv("hard")
 
 

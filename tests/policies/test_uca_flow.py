@@ -13,6 +13,8 @@ from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_confi
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.meanflow import sample_intervals
+from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
@@ -177,6 +179,48 @@ def test_loss_of_a_batch_is_the_mean_of_its_samples(policy):
         assert torch.equal(value, untouched[key]), f"forward changed {key}"
 
 
+def test_training_equals_the_plain_method(policy):
+    """No winners, no shared calls, no left-out tokens: the same loss and gradients, to rounding."""
+    policy.train()
+    batch = make_batch(policy.config, batch_size=8)
+    torch.manual_seed(1)
+    loss, _ = policy.forward(batch)
+    loss.backward()
+
+    config, encoder, network, x = policy.config, policy.model.encoder, policy.model.generator, batch["action"]
+    pooled = torch.relu(encoder.points.per_point(batch[OBS_POINT_CLOUD])).amax(dim=-2)
+    o = torch.cat([encoder.points.project(pooled), encoder.state(batch["observation.state"])], dim=-1)
+
+    def u_fn(z, t, h):
+        P = [
+            network.embed_observation(o) + network.observation_positions,
+            network.embed_timestep(t)[:, None] + network.timestep_biases,
+            network.embed_interval(h)[:, None] + network.interval_biases,
+        ]
+        tokens = torch.cat([*P, network.embed_action(z) + network.action_positions], dim=1)
+        for block in network.blocks:
+            tokens = block(tokens, n_out=tokens.shape[1])
+        return network.head(tokens[:, -T:])
+
+    torch.manual_seed(1)
+    t, h, _ = sample_intervals(len(x), "cpu", mean=config.interval_mean, std=config.interval_std)
+    e = torch.randn_like(x)
+    z, target = (1 - t[:, None, None]) * x + t[:, None, None] * e, e - x
+    v = u_fn(z, t, torch.zeros_like(t))
+    u, D_t_u = torch.func.jvp(u_fn, (z, t, h), (v.detach(), torch.ones_like(t), torch.ones_like(h)))
+    V = u + h[:, None, None] * D_t_u.detach()
+    errors = [(velocity - target).square().sum(dim=(1, 2)) for velocity in (V, v)]
+    plain = sum((error / (error.detach() + config.c) ** (1 - config.gamma)).mean() for error in errors)
+
+    torch.testing.assert_close(loss, plain)
+    parameters = dict(policy.model.named_parameters())
+    expected = torch.autograd.grad(plain, list(parameters.values()))
+    for (name, parameter), gradient in zip(parameters.items(), expected, strict=True):
+        torch.testing.assert_close(
+            parameter.grad, gradient, rtol=1e-4, atol=1e-6, msg=lambda m, name=name: f"{name}: {m}"
+        )
+
+
 def test_padded_actions_are_masked(policy):
     batch = make_batch(policy.config)
     batch["action_is_pad"][:, -1] = True
@@ -213,6 +257,17 @@ def test_overfitting_one_batch_drives_the_one_step_error_down(dual_pass):
         optimizer.step()
         policy.update()
     assert error() < 0.2 * before
+
+
+@pytest.mark.parametrize("conditioning", ["cross_attention", "adaln"])
+def test_a_checkpoint_remembers_which_ablation_it_is(conditioning, tmp_path):
+    policy = UCAFlowPolicy(make_config(conditioning=conditioning, dual_pass=False)).eval()
+    policy.save_pretrained(tmp_path)
+    loaded = UCAFlowPolicy.from_pretrained(tmp_path)
+    assert (loaded.config.conditioning, loaded.config.dual_pass) == (conditioning, False)
+    assert type(loaded.model.generator) is CONDITIONING[conditioning]
+    noise, observation = torch.randn(2, T, N_ACTIONS), make_observation(2)
+    assert torch.equal(loaded.select_action(observation, noise=noise), policy.select_action(observation, noise=noise))
 
 
 def test_averaged_weights_follow_the_stated_schedule():
@@ -289,6 +344,10 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
         ({"inference": "tensorrt"}, "policy.inference must be eager or onnxruntime, got 'tensorrt'"),
         ({"n_layers": 0}, "policy.n_layers must be at least 1, got 0"),
+        (
+            {"conditioning": "film"},
+            "policy.conditioning must be one of unified, cross_attention, adaln, got 'film'",
+        ),
     ],
 )
 def test_wrong_settings(changes, message):

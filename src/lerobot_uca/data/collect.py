@@ -5,7 +5,9 @@ Example:
 """
 
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from tqdm import tqdm
 
 from lerobot_uca.data.demonstrations import demonstrations
 from lerobot_uca.envs.configs import PointCloudEnvConfig
+from lerobot_uca.envs.expert import Attempt
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -33,7 +36,7 @@ MAX_ATTEMPTS = 20
 
 @dataclass
 class CollectConfig:
-    """Make demonstrations of a simulated task with its scripted expert, as a LeRobot dataset.
+    """Make demonstrations of a simulated task with an expert, as a LeRobot dataset.
 
     lerobot-uca-collect --env.type=metaworld_pointcloud --env.task=dial-turn --repo_id=local/dial-turn --root=data
 
@@ -46,6 +49,9 @@ class CollectConfig:
     repo_id: str
     # Folder to write; by default where LeRobot looks for it, $HF_LEROBOT_HOME/repo_id.
     root: Path | None = None
+    # Who demonstrates. Meta-World's experts are built in; Adroit's are files: weights as .npz or as an original DAPG
+    # pickle, or a Minari dataset such as minari:D4RL/door/expert-v2. '{task}' stands for each task.
+    expert: str | None = None
     # Successful demonstrations of each task.
     n_episodes: int = 10
     # Seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of
@@ -77,6 +83,7 @@ def collect(config: CollectConfig) -> LeRobotDataset:
     except HFValidationError as error:
         raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
     env_config.validate()
+    attempts = _attempts(config, env_config)  # before anything is written: there may be no such expert
     root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
     unfinished, replaced = (root.with_name(f".{root.name}.{state}") for state in ("unfinished", "replaced"))
     try:
@@ -84,7 +91,7 @@ def collect(config: CollectConfig) -> LeRobotDataset:
             raise UserError(f"'{root}' exists. Choose another --root, or replace it with --overwrite.")
         root.parent.mkdir(parents=True, exist_ok=True)
         _remove(unfinished)
-        _write(config, env_config, unfinished)
+        _write(config, env_config, attempts, unfinished)
         _replace(root, unfinished, backup=replaced)
     except OSError as error:
         raise UserError(f"Cannot write '{root}': {error}") from error
@@ -118,29 +125,36 @@ def _remove(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write(config: CollectConfig, env_config: PointCloudEnvConfig, root: Path) -> None:
+def _attempts(config: CollectConfig, env_config: PointCloudEnvConfig) -> dict[str, Iterator[Attempt]]:
+    # Groups may overlap; a task's episodes are wanted once.
+    tasks = dict.fromkeys(task for tasks in env_config.tasks().values() for task in tasks)
+    return {task: env_config.attempts(task, config.expert, config.seed) for task in tasks}
+
+
+def _write(
+    config: CollectConfig, env_config: PointCloudEnvConfig, attempts: dict[str, Iterator[Attempt]], root: Path
+) -> None:
     dataset = LeRobotDataset.create(
         config.repo_id, fps=env_config.fps, features=_features(env_config), root=root, use_videos=False
     )
     try:
-        # Groups may overlap; a task's episodes are wanted once.
-        for task in dict.fromkeys(task for tasks in env_config.tasks().values() for task in tasks):
-            _collect_task(dataset, env_config, task, config.n_episodes, config.seed)
+        for task, of_task in attempts.items():
+            _collect_task(dataset, env_config, task, of_task, config.n_episodes)
     finally:
         dataset.finalize()  # closes its files, which would otherwise come back when they are garbage-collected
 
 
 def _collect_task(
-    dataset: LeRobotDataset, env_config: PointCloudEnvConfig, task: str, n_episodes: int, first_seed: int
+    dataset: LeRobotDataset, env_config: PointCloudEnvConfig, task: str, attempts: Iterator[Attempt], n_episodes: int
 ) -> None:
     description = env_config.task_description(task)
-    episodes = demonstrations(
-        env_config.env_factory(task), env_config.expert_factory(task), first_seed=first_seed, n_wanted=n_episodes
-    )
+    attempts = islice(attempts, MAX_ATTEMPTS * n_episodes)
+    episodes = demonstrations(env_config.env_factory(task), attempts, n_wanted=n_episodes)
+    n_tried = 0
     with tqdm(total=n_episodes, desc=f"Demonstrations of {task}", unit="episode") as progress:
         for n_tried, episode in enumerate(episodes, start=1):
             if episode.is_successful:
-                for point_cloud, state, action, _ in zip(*episode, strict=True):
+                for point_cloud, state, action in zip(*episode[:3], strict=True):
                     dataset.add_frame(
                         {OBS_POINT_CLOUD: point_cloud, OBS_STATE: state, ACTION: action, "task": description}
                     )
@@ -148,10 +162,10 @@ def _collect_task(
                     dataset.save_episode()
                 progress.update()
             progress.set_postfix(tried=n_tried)
-            if n_tried >= MAX_ATTEMPTS * n_episodes and progress.n < n_episodes:
-                raise UserError(
-                    f"The expert of '{task}' succeeded in {progress.n} of {n_tried} episodes, {n_episodes} are wanted."
-                )
+        if progress.n < n_episodes:
+            raise UserError(
+                f"The expert of '{task}' succeeded in {progress.n} of {n_tried} episodes, {n_episodes} are wanted."
+            )
 
 
 def _features(env_config: PointCloudEnvConfig) -> dict[str, dict[str, Any]]:

@@ -5,64 +5,60 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from itertools import count
+from itertools import islice
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.expert import Expert
-
-MIN_SUCCESSFUL_STEPS = 5
-"""What makes an episode a demonstration (the baselines' rule for Meta-World)."""
+from lerobot_uca.envs.expert import Attempt
+from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 
 
 class Demonstration(NamedTuple):
-    """One episode: what was seen before each of L steps, what was done, and whether the step ended in success."""
+    """One episode: what was seen before each of L steps, what was done, and whether it is worth keeping."""
 
     point_cloud: NDArray[np.float32]  # (L, N, 3)
     state: NDArray[np.float32]  # (L, S)
     action: NDArray[np.float32]  # (L, A), as executed
-    success: NDArray[np.bool_]  # (L,)
-
-    @property
-    def is_successful(self) -> bool:
-        """Whether it is worth keeping."""
-        return self.success.sum() >= MIN_SUCCESSFUL_STEPS
+    is_successful: bool
 
 
-def demonstrate(env_factory: Callable[[], gym.Env], expert_factory: Callable[[], Expert], seed: int) -> Demonstration:
-    """Run the expert for a whole episode, also past its first success."""
-    env, expert = env_factory(), expert_factory()
-    observation, _ = env.reset(seed=seed)
+def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> Demonstration:
+    """Run an expert for a whole episode, also past its first success."""
+    env, expert = env_factory(), attempt.expert()
+    observation, _ = env.reset(**attempt.reset)
     steps: list[tuple[Any, ...]] = []
-    truncated = False
-    while not truncated:
+    n_successful = 0
+    is_over = False
+    while not is_over:
         action = expert(env)
-        before = observation
-        observation, _, _, truncated, info = env.step(action)
-        steps.append((before["point_cloud"], before["agent_pos"], action, info["is_success"]))
+        steps.append((observation["point_cloud"], observation["agent_pos"], action))
+        observation, _, terminated, truncated, info = env.step(action)
+        n_successful += info["is_success"]
+        is_over = truncated or (terminated and not info["is_success"])
     env.close()
-    return Demonstration(*(np.stack(column) for column in zip(*steps, strict=True)))
+    point_cloud, state, actions = (np.stack(column) for column in zip(*steps, strict=True))
+    return Demonstration(point_cloud, state, actions, n_successful >= env.min_successful_steps)
 
 
 def demonstrations(
-    env_factory: Callable[[], gym.Env], expert_factory: Callable[[], Expert], *, first_seed: int, n_wanted: int
+    env_factory: Callable[[], PointCloudEnv], attempts: Iterator[Attempt], *, n_wanted: int
 ) -> Iterator[Demonstration]:
-    """Episodes of seeds first_seed, first_seed + 1, ... in this order, until n_wanted of them were successful.
+    """Episodes of the attempts in their order, until n_wanted of them were successful or there are no more.
 
     They are made by one process a core.
     """
     n_workers = os.cpu_count() or 1
     with ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context("forkserver")) as pool:
-        seeds = count(first_seed)
         pending: deque[Future[Demonstration]] = deque()
         n_missing = n_wanted
         while n_missing:
             # Never more than may still be needed: leaving the pool waits for the episodes that are running.
-            while len(pending) < min(n_missing, n_workers + 1):
-                pending.append(pool.submit(demonstrate, env_factory, expert_factory, next(seeds)))
+            n_idle = max(0, min(n_missing, n_workers + 1) - len(pending))
+            pending.extend(pool.submit(demonstrate, env_factory, attempt) for attempt in islice(attempts, n_idle))
+            if not pending:
+                return
             episode = pending.popleft().result()
             n_missing -= episode.is_successful
             yield episode

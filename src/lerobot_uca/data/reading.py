@@ -120,6 +120,11 @@ def _getstate(self: LeRobotDataset) -> dict[str, Any]:
     return self.__dict__.copy()
 
 
+def is_batched() -> bool:
+    """Whether datasets without cameras are read by this module: it is not switched off, and knows this LeRobot."""
+    return LeRobotDataset.__dict__.get("__getitems__") is _getitems
+
+
 def _install() -> None:
     if os.environ.get(SWITCH, "1") == "0" or lerobot.__version__ != SUPPORTED_LEROBOT:
         return

@@ -1,7 +1,8 @@
 """LeRobot's configurations of the environments: what `--env.type=...` finds."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, override
@@ -12,8 +13,9 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_uca.envs import metaworld
-from lerobot_uca.envs.expert import Expert
+from lerobot_uca.envs import adroit, adroit_experts, metaworld
+from lerobot_uca.envs.expert import Attempt, attempts_by_seed
+from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -26,11 +28,12 @@ class PointCloudEnvConfig(EnvConfig):
     n_points: int = 512
 
     def __post_init__(self) -> None:
-        self.features = {
-            ACTION: PolicyFeature(FeatureType.ACTION, (len(self.action_names()),)),
-            "point_cloud": PolicyFeature(FeatureType.STATE, (self.n_points, 3)),
-            "agent_pos": PolicyFeature(FeatureType.STATE, (len(self.state_names()),)),
-        }
+        with suppress(UserError):  # of wrong tasks; validate() tells it, here draccus would swallow the message
+            self.features = {
+                ACTION: PolicyFeature(FeatureType.ACTION, (len(self.action_names()),)),
+                "point_cloud": PolicyFeature(FeatureType.STATE, (self.n_points, 3)),
+                "agent_pos": PolicyFeature(FeatureType.STATE, (len(self.state_names()),)),
+            }
         self.features_map = {ACTION: ACTION, "point_cloud": OBS_POINT_CLOUD, "agent_pos": OBS_STATE}
 
     @abstractmethod
@@ -38,12 +41,12 @@ class PointCloudEnvConfig(EnvConfig):
         """The tasks by suite: each entry of `task` is one."""
 
     @abstractmethod
-    def env_factory(self, task: str) -> Callable[[], gym.Env]:
+    def env_factory(self, task: str) -> Callable[[], PointCloudEnv]:
         """Makes one environment of one task; light to send to another process."""
 
     @abstractmethod
-    def expert_factory(self, task: str) -> Callable[[], Expert]:
-        """Makes the demonstrator of one task; light to send to another process."""
+    def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
+        """Tries at demonstrations of one task, by the expert that a user has named, from a seed upwards."""
 
     @abstractmethod
     def task_description(self, task: str) -> str:
@@ -111,12 +114,14 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
         return metaworld.resolve(self.task)
 
     @override
-    def env_factory(self, task: str) -> Callable[[], gym.Env]:
+    def env_factory(self, task: str) -> Callable[[], PointCloudEnv]:
         return partial(metaworld.MetaworldPointCloudEnv, task, n_points=self.n_points)
 
     @override
-    def expert_factory(self, task: str) -> Callable[[], Expert]:
-        return partial(metaworld.ScriptedExpert, task)
+    def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
+        if expert:
+            raise UserError(f"Meta-World's experts are built in. Leave --expert out, got '{expert}'.")
+        return attempts_by_seed(partial(metaworld.ScriptedExpert, task), first_seed)
 
     @override
     def task_description(self, task: str) -> str:
@@ -129,3 +134,56 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
     @override
     def state_names(self) -> list[str]:
         return [f"{part}_{axis}" for part in ("hand", "right_finger", "left_finger") for axis in "xyz"]
+
+
+@EnvConfig.register_subclass("adroit_pointcloud")
+@dataclass
+class AdroitPointCloudConfig(PointCloudEnvConfig):
+    """Adroit's dexterous tasks: hammer, door, pen, relocate, or paper (the first three), all."""
+
+    # One task, several separated by commas, or a group.
+    task: str | None = "door"
+    # Points of each cloud.
+    n_points: int = 1024
+    # The rate of actions, each of which is repeated twice; it cannot be changed.
+    fps: int = adroit.FPS
+    # What counts as success. final: the goal is reached when the episode's time is over, as in the papers.
+    # any: the goal is reached at any time, as in gymnasium-robotics.
+    success: str = "final"
+
+    @override
+    def validate(self) -> None:
+        super().validate()
+        adroit.judge_of(self.success)
+
+    @override
+    def tasks(self) -> dict[str, tuple[str, ...]]:
+        return adroit.resolve(self.task)
+
+    @override
+    def env_factory(self, task: str) -> Callable[[], PointCloudEnv]:
+        return partial(
+            adroit.AdroitPointCloudEnv,
+            task,
+            n_points=self.n_points,
+            success=self.success,
+            joints=self.action_names(),
+        )
+
+    @override
+    def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
+        return adroit_experts.attempts(task, expert, first_seed)
+
+    @override
+    def task_description(self, task: str) -> str:
+        return adroit.TASKS[task].description
+
+    @override
+    def action_names(self) -> list[str]:
+        """The joints of all the tasks, since several tasks share one action."""
+        used = {joint for tasks in self.tasks().values() for task in tasks for joint in adroit.TASKS[task].joints}
+        return [joint for joint in adroit.ARM + adroit.HAND if joint in used]
+
+    @override
+    def state_names(self) -> list[str]:
+        return list(adroit.HAND)

@@ -6,15 +6,14 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.point_cloud import Camera, Crop, sample_farthest
-from lerobot_uca.envs.ray_casting import Marker, PictureCamera, PointCloudCamera
-from lerobot_uca.envs.task_names import resolve_tasks
-from lerobot_uca.errors import UserError
+from lerobot_uca.envs.point_cloud import Array, Camera, Crop
+from lerobot_uca.envs.point_cloud_env import Observation, PointCloudEnv
+from lerobot_uca.envs.ray_casting import Marker
+from lerobot_uca.envs.task_names import only_task, resolve_tasks
 
 # Meta-World's camera 'corner2' (euler 3.9 2.3 0.6), moved to where DP3, FlowPolicy and MP1 put it. Its axes are
 # written out because the camera must exist before the simulator does; a test compares them with the model's.
@@ -32,7 +31,6 @@ def corner2(width: int, height: int) -> Camera:
 
 CLOUD_CAMERA = corner2(128, 128)
 PICTURE_CAMERA = corner2(160, 160)
-PICTURE_ZOOM = 2  # each ray becomes 2 x 2 pixels: 320 x 320 is large enough to look at, and four times cheaper
 
 # The crop decides how well a policy learns, because every point on the table, the retaining wall around it or the
 # upper arm is one fewer on the task: it is as tight as the 50 tasks' objects and goals allow.
@@ -86,51 +84,40 @@ def resolve(spec: str | None) -> dict[str, tuple[str, ...]]:
     return resolve_tasks(entries, benchmark="Meta-World", tasks=task_descriptions(), groups=task_groups())
 
 
-class MetaworldPointCloudEnv(gym.Env[Any, Any]):
+class MetaworldPointCloudEnv(PointCloudEnv):
     """One Meta-World task, observed as the baselines observe it: a point cloud and the gripper's position.
 
-    Observation, world frame, metres:
-        point_cloud: (n_points, 3) float32, farthest point sampling of what `corner2` sees inside the crop, in
-            sampling order.
-        agent_pos: (9,) float32, positions of the hand, the right and the left finger.
-    Action: (4,) float32 in [-1, 1]: a motion of the hand by up to 1 cm along x, y and z, and the gripper's effort.
+    `agent_pos` (9,) [m, world frame]: positions of the hand, the right and the left finger.
+    Action (4,): a motion of the hand by up to 1 cm along x, y and z, and the gripper's effort.
     An episode terminates at the first success and is truncated after 200 steps. Stepping past a success is allowed
-    (the demonstrations do), as the simulation itself goes on. The simulator is created at the first reset, so
-    that vector environments build it in their workers.
+    (the demonstrations do), as the simulation itself goes on.
 
     Args:
         task: a name from `task_descriptions()`, with or without '-v3'.
         n_points: points of the cloud.
     """
 
+    benchmark = "Meta-World"
+    min_successful_steps = 5  # the baselines' rule
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium's own declaration)
-    render_mode = "rgb_array"
     _max_episode_steps = EPISODE_LENGTH  # LeRobot reads it
 
     def __init__(self, task: str, n_points: int = 512) -> None:
-        ((self.task, *others),) = resolve(task).values()
-        if others:
-            raise UserError(f"An environment has one task, got the group '{task}'.")
-        self.task_description = task_descriptions()[self.task]
-        self.n_points = n_points
-        self.observation_space = gym.spaces.Dict(
-            {
-                "point_cloud": gym.spaces.Box(-np.inf, np.inf, (n_points, 3), np.float32),
-                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (9,), np.float32),
-            }
+        task = only_task(task, resolve(task))
+        super().__init__(
+            task,
+            task_descriptions()[task],
+            n_points=n_points,
+            n_states=9,
+            n_actions=4,
+            camera=CLOUD_CAMERA,
+            crop=HOLE_CROP if task in HOLE_TASKS else CROP,
+            picture_camera=PICTURE_CAMERA,
         )
-        self.action_space = gym.spaces.Box(-1, 1, (4,), np.float32)
-        self.expert_observation: Any = None
-        """Meta-World's own observation (39,) after the last reset or step, goal included: for scripted experts."""
-        self._simulator: Any = None
-        self.crop = HOLE_CROP if self.task in HOLE_TASKS else CROP
-        self._cloud_camera = PointCloudCamera(CLOUD_CAMERA, self.crop)
-        self._picture_camera: PictureCamera | None = None
-        self._n_steps = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: the seed alone decides which. Without a seed, one is drawn. There are no options."""
         super().reset(seed=seed, options=options)
         # A fresh simulator each time: some tasks keep state of the last episode, and the seed alone must decide.
@@ -142,49 +129,21 @@ class MetaworldPointCloudEnv(gym.Env[Any, Any]):
         self._n_steps = 0
         return self._observe(), {"is_success": False}
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[dict[str, NDArray[np.float32]], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute an action for 12.5 ms of simulated time."""
-        if np.shape(action) != (4,) or not np.all(np.isfinite(action)):
-            raise UserError(f"Meta-World {self.task}: an action must be 4 finite numbers, got {action}.")
-        simulator = self._running_simulator()
-        self.expert_observation, reward, _, _, info = simulator.step(np.clip(action, -1, 1))
+        action = self._clipped(action)
+        self.expert_observation, reward, _, _, info = self._running_simulator().step(action)
         self._n_steps += 1
         success = bool(info["success"])
         return self._observe(), float(reward), success, self._n_steps >= EPISODE_LENGTH, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
         """The scene as a shaded ray-cast picture, (320, 320, 3) uint8."""
-        simulator = self._running_simulator()
-        self._picture_camera = self._picture_camera or PictureCamera(PICTURE_CAMERA)
-        picture = self._picture_camera.capture(simulator.model, simulator.data, self._markers())
-        # corner2 hangs upside down; people look at this picture, so turn it.
-        return picture[::-1, ::-1].repeat(PICTURE_ZOOM, axis=0).repeat(PICTURE_ZOOM, axis=1)
+        return super().render()[::-1, ::-1]  # corner2 hangs upside down; people look at this picture, so turn it
 
-    def close(self) -> None:
-        """Free the simulator; a later reset makes a new one."""
-        self._simulator = None
-
-    def _running_simulator(self) -> Any:
-        if self._simulator is None:
-            raise UserError(f"Meta-World {self.task}: call reset() first.")
-        return self._simulator
-
-    def _observe(self) -> dict[str, NDArray[np.float32]]:
-        simulator = self._simulator
-        points = self._cloud_camera.capture(simulator.model, simulator.data, self._markers())
-        if len(points) == 0:
-            raise UserError(
-                f"Meta-World {self.task}: the cloud is empty. Camera {CLOUD_CAMERA.name} at {CLOUD_CAMERA.position} "
-                f"sees no point inside the crop {self.crop.low} to {self.crop.high} m."
-            )
-        fingers = (simulator.data.site(name).xpos for name in ("rightEndEffector", "leftEndEffector"))
-        agent_pos = np.concatenate([simulator.get_endeff_pos(), *fingers])
-        return {
-            "point_cloud": sample_farthest(points, self.n_points),
-            "agent_pos": agent_pos.astype(np.float32),
-        }
+    def _agent_pos(self) -> Array:
+        fingers = (self._simulator.data.site(name).xpos for name in ("rightEndEffector", "leftEndEffector"))
+        return np.concatenate([self._simulator.get_endeff_pos(), *fingers])
 
     def _markers(self) -> list[Marker]:
         """Meta-World's goal sites. In push, pick-place or reach nothing else shows the goal.

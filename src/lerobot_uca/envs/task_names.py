@@ -24,5 +24,17 @@ def resolve_tasks(
     return {entry: groups.get(entry, (entry,)) for entry in entries}
 
 
+def only_task(spec: str, resolved: Mapping[str, tuple[str, ...]]) -> str:
+    """The one task that `resolve_tasks` has found for `spec`.
+
+    Raises:
+        UserError: if there are several.
+    """
+    task, *others = (task for tasks in resolved.values() for task in tasks)
+    if others:
+        raise UserError(f"An environment has one task, got '{spec}', which stands for several.")
+    return task
+
+
 def _valid(benchmark: str, tasks: Collection[str], groups: Mapping[str, tuple[str, ...]]) -> str:
     return f"{benchmark} tasks: {', '.join(tasks)}; groups: {', '.join(groups)}."

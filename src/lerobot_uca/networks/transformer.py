@@ -1,8 +1,11 @@
 """The Unified Condition-Action Transformer (paper sections 3.2 and 3.3).
 
 Letters: B samples, T horizon, A action dimensions, O observation steps, F observation features, D token width,
-S tokens of the sequence.
+S tokens of the sequence, P condition tokens, Y action tokens.
 """
+
+from abc import abstractmethod
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -46,12 +49,14 @@ class Block(nn.Module):
         return tokens + self.feed_forward(tokens)
 
 
-class UnifiedTransformer(nn.Module):
-    """u(z, t, h, o): conditions and actions are tokens of one sequence and refine each other.
+class ConditionActionTransformer(nn.Module):
+    """u(z, t, h, o) from condition tokens P = [c_1 .. c_O, tau_1 .. tau_Nt, eta_1 .. eta_Nh] and action tokens Y.
 
-    The sequence is [c_1 .. c_O, tau_1 .. tau_Nt, eta_1 .. eta_Nh, y_1 .. y_T]: observations, timestep, interval,
-    actions. The output head reads the action tokens alone.
+    P stands for observations, timestep and interval, Y for the noisy actions; the output head reads Y alone. A subclass
+    says how P reaches Y (`refine`), the one thing in which UCA-Flow and its ablations differ.
     """
+
+    block: ClassVar[type[nn.Module]]
 
     def __init__(
         self,
@@ -67,7 +72,6 @@ class UnifiedTransformer(nn.Module):
         n_interval_tokens: int,
     ) -> None:
         super().__init__()
-        self.horizon = horizon
         self.embed_observation = nn.Linear(n_obs_features, dim)
         self.embed_timestep = TimeEmbedding(dim)
         self.embed_interval = TimeEmbedding(dim)
@@ -76,21 +80,35 @@ class UnifiedTransformer(nn.Module):
         self.timestep_biases = nn.Parameter(0.02 * torch.randn(n_timestep_tokens, dim))
         self.interval_biases = nn.Parameter(0.02 * torch.randn(n_interval_tokens, dim))
         self.action_positions = nn.Parameter(0.02 * torch.randn(horizon, dim))
-        self.blocks = nn.ModuleList(Block(dim, n_heads) for _ in range(n_layers))
+        self.blocks = nn.ModuleList(self.block(dim, n_heads) for _ in range(n_layers))
         self.head = nn.Sequential(nn.LayerNorm(dim), nn.Linear(dim, n_actions))
+
+    @abstractmethod
+    def refine(self, P: Tensor, Y: Tensor) -> Tensor:
+        """Action tokens (B, T, D) after all blocks, from condition tokens P (B, S, D) and action tokens Y (B, T, D)."""
 
     def forward(self, z: Tensor, t: Tensor, h: Tensor, o: Tensor) -> Tensor:
         """Z (B, T, A), t (B,), h (B,), o (B, O, F) to u (B, T, A)."""
-        tokens = torch.cat(
+        P = torch.cat(
             [
                 self.embed_observation(o) + self.observation_positions,
                 self.embed_timestep(t)[:, None] + self.timestep_biases,
                 self.embed_interval(h)[:, None] + self.interval_biases,
-                self.embed_action(z) + self.action_positions,
             ],
             dim=1,
         )
+        return self.head(self.refine(P, self.embed_action(z) + self.action_positions))
+
+
+class UnifiedTransformer(ConditionActionTransformer):
+    """Conditions and actions are tokens of one sequence [P, Y] and refine each other."""
+
+    block = Block
+
+    def refine(self, P: Tensor, Y: Tensor) -> Tensor:
+        """All tokens go through the blocks; of the last one only the actions are read."""
+        tokens = torch.cat([P, Y], dim=1)
         *earlier, last = self.blocks
         for block in earlier:
             tokens = block(tokens, n_out=tokens.shape[1])
-        return self.head(last(tokens, n_out=self.horizon))  # what nobody reads is not computed
+        return last(tokens, n_out=Y.shape[1])  # what nobody reads is not computed

@@ -6,6 +6,7 @@ from typing import override
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 
 
@@ -14,7 +15,7 @@ from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 class UCAFlowConfig(PointCloudPolicyConfig):
     """Configuration of `UCAFlowPolicy`. See `PointCloudPolicyConfig` for horizons, encoder and training recipe.
 
-    The paper states none of the following values but dual_pass; each says where it comes from.
+    The paper states none of the following values but conditioning and dual_pass; each says where it comes from.
     """
 
     # Width D of the tokens. With 256 there are 3.5 million parameters, half of Simple DP3's; 128 gives
@@ -29,6 +30,9 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # Interval tokens N_h; likewise.
     n_interval_tokens: int = 4
 
+    # How conditions reach the actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
+    # same size).
+    conditioning: str = "unified"
     # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
     inference: str = "onnxruntime"
 
@@ -52,3 +56,5 @@ class UCAFlowConfig(PointCloudPolicyConfig):
                 raise UserError(f"policy.{name} must be at least 1, got {getattr(self, name)}.")
         if self.dim < 2 or self.dim % 2 or self.dim % self.n_heads:
             raise UserError(f"policy.dim must be even and a multiple of n_heads = {self.n_heads}, got {self.dim}.")
+        if self.conditioning not in CONDITIONING:
+            raise UserError(f"policy.conditioning must be one of {', '.join(CONDITIONING)}, got '{self.conditioning}'.")

@@ -3,7 +3,7 @@
 from torch import Tensor, nn
 
 from lerobot_uca.meanflow import meanflow_losses, one_step_sample
-from lerobot_uca.networks.transformer import UnifiedTransformer
+from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_base import MethodLoss, PointCloudPolicy
 
@@ -16,9 +16,9 @@ class UCAFlowPolicy(PointCloudPolicy):
     config: UCAFlowConfig
 
     def make_generator(self) -> nn.Module:
-        """The Unified Condition-Action Transformer."""
+        """The Unified Condition-Action Transformer, or what an ablation puts in its place."""
         config = self.config
-        return UnifiedTransformer(
+        return CONDITIONING[config.conditioning](
             horizon=config.horizon,
             n_actions=config.n_actions,
             n_obs_steps=config.n_obs_steps,

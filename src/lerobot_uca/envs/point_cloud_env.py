@@ -1,0 +1,117 @@
+"""What all simulated tasks with point-cloud observations do alike. A benchmark adds its simulator and its data."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.envs.point_cloud import Array, Camera, Crop, sample_farthest
+from lerobot_uca.envs.ray_casting import Marker, PictureCamera, PointCloudCamera
+from lerobot_uca.errors import UserError
+
+PICTURE_ZOOM = 2  # each ray becomes 2 x 2 pixels: 320 x 320 is large enough to look at, and four times cheaper
+
+Observation = dict[str, NDArray[np.float32]]
+
+
+class PointCloudEnv(gym.Env[Any, Any]):
+    """One task of a MuJoCo benchmark, observed as a point cloud and the robot's own state.
+
+    Observation:
+        point_cloud: (n_points, 3) float32, world frame [m], farthest point sampling of what the camera sees inside
+            the crop, in sampling order.
+        agent_pos: (n_states,) float32, the robot's own state, in the benchmark's units.
+    Action: (n_actions,) float32 in [-1, 1]; what lies outside is clipped.
+    The simulator is created at the first reset, so that vector environments build it in their workers.
+
+    Args:
+        task: its name.
+        description: what it asks for, in English.
+        n_points, n_states, n_actions: lengths of cloud, agent_pos and action.
+        camera: what the cloud is seen with.
+        crop: what belongs to the cloud.
+        picture_camera: what people see the task with.
+    """
+
+    benchmark: ClassVar[str]
+    min_successful_steps: ClassVar[int]
+    """What makes an episode a demonstration."""
+    render_mode = "rgb_array"
+
+    def __init__(
+        self,
+        task: str,
+        description: str,
+        *,
+        n_points: int,
+        n_states: int,
+        n_actions: int,
+        camera: Camera,
+        crop: Crop,
+        picture_camera: Camera,
+    ) -> None:
+        self.task, self.task_description = task, description
+        self.n_points, self.crop = n_points, crop
+        self.observation_space = gym.spaces.Dict(
+            {
+                "point_cloud": gym.spaces.Box(-np.inf, np.inf, (n_points, 3), np.float32),
+                "agent_pos": gym.spaces.Box(-np.inf, np.inf, (n_states,), np.float32),
+            }
+        )
+        self.n_actions = n_actions
+        self.action_space = gym.spaces.Box(-1, 1, (n_actions,), np.float32)
+        self.expert_observation: Any = None
+        """The simulator's own observation after the last reset or step, goal included: for experts."""
+        self._simulator: Any = None
+        self._cloud_camera = PointCloudCamera(camera, crop)
+        self._picture_camera = picture_camera
+        self._picture: PictureCamera | None = None
+        self._n_steps = 0
+
+    def render(self) -> NDArray[np.uint8]:
+        """The scene as a shaded ray-cast picture, (320, 320, 3) uint8."""
+        simulator = self._running_simulator()
+        self._picture = self._picture or PictureCamera(self._picture_camera)
+        picture = self._picture.capture(simulator.model, simulator.data, self._markers())
+        return picture.repeat(PICTURE_ZOOM, axis=0).repeat(PICTURE_ZOOM, axis=1)
+
+    def close(self) -> None:
+        """Free the simulator; a later reset makes a new one."""
+        self._simulator = None
+
+    @abstractmethod
+    def _agent_pos(self) -> Array:
+        """The robot's own state, (n_states,)."""
+
+    def _markers(self) -> Sequence[Marker]:
+        """Goals that no geom shows."""
+        return ()
+
+    def _observe(self) -> Observation:
+        simulator, camera = self._simulator, self._cloud_camera.camera
+        points = self._cloud_camera.capture(simulator.model, simulator.data, self._markers())
+        if len(points) == 0:
+            raise UserError(
+                f"{self.benchmark} {self.task}: the cloud is empty. Camera {camera.name} at {camera.position} "
+                f"sees no point inside the crop {self.crop.low} to {self.crop.high} m."
+            )
+        return {
+            "point_cloud": sample_farthest(points, self.n_points),
+            "agent_pos": self._agent_pos().astype(np.float32),
+        }
+
+    def _clipped(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What is executed of an action."""
+        if np.shape(action) != (self.n_actions,) or not np.all(np.isfinite(action)):
+            raise UserError(
+                f"{self.benchmark} {self.task}: an action must be {self.n_actions} finite numbers, got {action}."
+            )
+        return np.clip(action, -1, 1)
+
+    def _running_simulator(self) -> Any:
+        if self._simulator is None:
+            raise UserError(f"{self.benchmark} {self.task}: call reset() first.")
+        return self._simulator

@@ -1,0 +1,62 @@
+"""The ablation '-Unified/c': action tokens look at the conditions by cross-attention, the conditions stay as they are.
+
+Letters as in `transformer`.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_uca.networks.transformer import ConditionActionTransformer, SelfAttention
+
+
+class CrossAttention(nn.Module):
+    """Multi-head attention of the action tokens to the condition tokens; see `SelfAttention` for its softmax."""
+
+    def __init__(self, dim: int, n_heads: int) -> None:
+        super().__init__()
+        self.n_heads = n_heads
+        self.q = nn.Linear(dim, dim)
+        self.kv = nn.Linear(dim, 2 * dim)
+        self.out = nn.Linear(dim, dim)
+
+    def forward(self, Y: Tensor, P: Tensor) -> Tensor:
+        """Y (B, T, D) and P (B, S, D) to (B, T, D)."""
+        q = self.q(Y).unflatten(-1, (self.n_heads, -1)).transpose(1, 2)  # (B, heads, T, d)
+        k, v = self.kv(P).unflatten(-1, (2, self.n_heads, -1)).permute(2, 0, 3, 1, 4)  # (B, heads, S, d)
+        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
+        return self.out((weights @ v).transpose(1, 2).flatten(-2))
+
+
+class CrossAttentionBlock(nn.Module):
+    """Self-attention among the actions, cross-attention to the conditions, feed-forward.
+
+    The feed-forward layer is half as wide as `Block`'s, which pays for the cross-attention: 12 D^2 weights as there.
+    """
+
+    def __init__(self, dim: int, n_heads: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(dim)
+        self.attention = SelfAttention(dim, n_heads)
+        self.norm_actions, self.norm_conditions = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.cross_attention = CrossAttention(dim, n_heads)
+        self.feed_forward = nn.Sequential(
+            nn.LayerNorm(dim), nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim)
+        )
+
+    def forward(self, Y: Tensor, P: Tensor) -> Tensor:
+        """Y (B, T, D) and P (B, S, D) to (B, T, D)."""
+        Y = Y + self.attention(self.norm(Y), n_out=Y.shape[1])
+        Y = Y + self.cross_attention(self.norm_actions(Y), self.norm_conditions(P))
+        return Y + self.feed_forward(Y)
+
+
+class CrossAttentionTransformer(ConditionActionTransformer):
+    """Every block reads the same condition tokens."""
+
+    block = CrossAttentionBlock
+
+    def refine(self, P: Tensor, Y: Tensor) -> Tensor:
+        """Action tokens alone go through the blocks."""
+        for block in self.blocks:
+            Y = block(Y, P)
+        return Y

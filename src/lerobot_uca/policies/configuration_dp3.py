@@ -1,0 +1,29 @@
+"""Configuration of DP3."""
+
+from dataclasses import dataclass
+from typing import override
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.policies.configuration_unet import UNetPolicyConfig
+
+
+@PreTrainedConfig.register_subclass("dp3")
+@dataclass
+class DP3Config(UNetPolicyConfig):
+    """Configuration of `DP3Policy`."""
+
+    # Diffusion steps of training.
+    n_training_steps: int = 100
+    # Network calls of a prediction.
+    n_inference_steps: int = 10
+
+    @override
+    def validate_sizes(self) -> None:
+        super().validate_sizes()
+        if not 1 <= self.n_inference_steps <= self.n_training_steps:
+            raise UserError(
+                f"policy.n_inference_steps must be from 1 to n_training_steps = {self.n_training_steps}, "
+                f"got {self.n_inference_steps}."
+            )

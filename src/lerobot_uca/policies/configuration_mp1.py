@@ -1,0 +1,22 @@
+"""Configuration of MP1."""
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_uca.policies.configuration_unet import UNetPolicyConfig
+
+
+@PreTrainedConfig.register_subclass("mp1")
+@dataclass
+class MP1Config(UNetPolicyConfig):
+    """Configuration of `MP1Policy`."""
+
+    # Weight of the dispersive loss.
+    dispersive_weight: float = 0.5
+    # Of the adaptive weight 1 / (D^2 + c)^(1/2).
+    c: float = 1e-3
+    # t and r are two draws from sigmoid(N(interval_mean, interval_std^2)).
+    interval_mean: float = -0.4
+    # See interval_mean.
+    interval_std: float = 1.0

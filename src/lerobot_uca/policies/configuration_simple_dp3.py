@@ -1,0 +1,18 @@
+"""Configuration of Simple DP3."""
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_uca.policies.configuration_dp3 import DP3Config
+
+
+@PreTrainedConfig.register_subclass("simple_dp3")
+@dataclass
+class SimpleDP3Config(DP3Config):
+    """Configuration of `SimpleDP3Policy`: DP3 with a smaller U-Net."""
+
+    # Channels of the U-Net's levels; each level but the last halves the horizon.
+    unet_widths: tuple[int, ...] = (128, 256, 384)
+    # Residual blocks of a level and in the middle.
+    unet_blocks: int = 1

@@ -1,0 +1,158 @@
+"""What holds for every policy that this package registers."""
+
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_policy_config, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
+from tests.conftest import N_ACTIONS, SMALL_POLICIES, make_batch, make_observation, make_settings
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.policies.modeling_base import PointCloudPolicy
+
+NETWORK_CALLS = {"uca_flow": 1, "dp3": 10, "simple_dp3": 10, "flow": 1, "mp1": 1}
+
+VARIANTS = {
+    **{name: (name, {}) for name in NETWORK_CALLS},
+    "cross_attention": ("uca_flow", {"conditioning": "cross_attention"}),
+    "adaln": ("uca_flow", {"conditioning": "adaln"}),
+    "without dual pass": ("uca_flow", {"dual_pass": False}),
+}
+every_policy = pytest.mark.parametrize("variant", VARIANTS)
+
+
+def make(variant: str, **changes: object) -> PointCloudPolicy:
+    name, settings = VARIANTS[variant]
+    torch.manual_seed(0)
+    config = make_policy_config(name, **{**make_settings(), **SMALL_POLICIES[name], **settings, **changes})
+    return get_policy_class(name)(config)
+
+
+def test_every_registered_policy_is_here():
+    ours = {
+        name
+        for name in PreTrainedConfig.get_known_choices()
+        if PreTrainedConfig.get_choice_class(name).__module__.startswith("lerobot_uca.")
+    }
+    assert ours == set(NETWORK_CALLS)
+
+
+@pytest.mark.parametrize("name", NETWORK_CALLS)
+def test_lerobot_finds_policy_and_processors_by_the_types_name(name):
+    policy = make(name)
+    assert policy.name == policy.config.type == name
+    pre, post = make_pre_post_processors(policy.config)
+    names = [step._registry_name for step in (*pre.steps, *post.steps)]
+    assert {"normalizer_processor", "unnormalizer_processor"} <= set(names)
+
+
+@every_policy
+def test_training_steps_lower_the_loss_of_a_batch(variant):
+    """At the same noise and the same times."""
+    policy = make(variant).train()
+    batch = make_batch(policy.config)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-4)
+
+    def loss() -> torch.Tensor:
+        torch.manual_seed(1)
+        return policy.forward(batch)[0]
+
+    losses = []
+    for _ in range(4):
+        losses.append(loss())
+        optimizer.zero_grad()
+        losses[-1].backward()
+        assert all(parameter.grad is not None for parameter in policy.get_optim_params())
+        optimizer.step()
+    losses.append(loss())
+    assert losses == sorted(losses, reverse=True)
+
+
+@every_policy
+def test_each_sample_has_its_loss_and_padded_actions_do_not_count(variant):
+    policy = make(variant).train()
+    batch = make_batch(policy.config)
+    batch["action_is_pad"][3, -2:] = True
+    losses = []
+    for each in (batch, {**batch, "action_is_pad": torch.zeros_like(batch["action_is_pad"])}):
+        torch.manual_seed(1)
+        losses.append(policy.forward(each, reduction="none")[0])
+    assert losses[0].shape == (8,)
+    assert losses[0][3] != losses[1][3]
+    others = torch.arange(8) != 3
+    torch.testing.assert_close(losses[0][others], losses[1][others])
+
+
+@every_policy
+def test_actions_have_the_right_shape_and_take_the_stated_number_of_network_calls(variant):
+    policy = make(variant, inference="eager").eval()  # ONNX Runtime calls what it has traced
+    calls = []
+    policy.ema_model.generator.register_forward_hook(lambda *_: calls.append(1))
+    actions = [policy.select_action(make_observation(2)) for _ in range(4)]
+    assert all(action.shape == (2, N_ACTIONS) for action in actions)
+    assert len(calls) == 2 * NETWORK_CALLS[VARIANTS[variant][0]]  # the fourth action needs a second prediction
+
+
+@every_policy
+def test_a_loaded_checkpoint_gives_equal_actions(variant, tmp_path):
+    policy = make(variant).eval()
+    policy.save_pretrained(tmp_path)
+    loaded = type(policy).from_pretrained(tmp_path)
+    assert loaded.config.type == policy.config.type
+    noise, observation = torch.randn(2, 4, N_ACTIONS), make_observation(2)
+    assert torch.equal(loaded.select_action(observation, noise=noise), policy.select_action(observation, noise=noise))
+
+
+@every_policy
+def test_training_in_bfloat16(variant):
+    policy = make(variant, dtype="bfloat16").train()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss, _ = policy.forward(make_batch(policy.config))
+        actions = policy.predict_action_chunk(make_observation())
+    loss.backward()
+    assert all(parameter.grad.isfinite().all() for parameter in policy.get_optim_params())
+    assert actions.dtype == torch.float32
+
+
+@pytest.mark.parametrize(("name", "n_steps"), [("dp3", 50), ("flow", 150), ("mp1", 150)])
+def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
+    policy = make(name, unet_widths=(32, 64), ema_power=0.6)
+    batch = make_batch(policy.config, batch_size=4)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3)
+
+    def error() -> float:
+        policy.eval()
+        chunk = policy.predict_action_chunk(batch)
+        policy.train()
+        return (chunk - batch["action"][:, policy.config.executed]).abs().mean().item()
+
+    before = error()
+    repeated = {key: value.repeat(8, *[1] * (value.ndim - 1)) for key, value in batch.items()}
+    for _ in range(n_steps):
+        loss, _ = policy.forward(repeated)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        policy.update()
+    assert error() < 0.4 * before
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("dp3", {"unet_widths": (8, 12)}, r"policy.unet_widths must be multiples of unet_groups = 8, got \[8, 12\]"),
+        ("dp3", {"unet_widths": ()}, r"policy.unet_widths must be multiples of unet_groups = 8, got \[\]"),
+        ("dp3", {"horizon": 6, "unet_widths": (8, 8, 8)}, "policy.horizon must be a multiple of 4, .* got 6"),
+        ("simple_dp3", {"unet_blocks": 0}, "policy.unet_blocks must be at least 1, got 0"),
+        ("simple_dp3", {"unet_groups": 0}, "policy.unet_groups must be at least 1, got 0"),
+        ("simple_dp3", {"unet_kernel_size": 4}, "policy.unet_kernel_size must be odd, got 4"),
+        ("flow", {"time_dim": 7}, "policy.time_dim must be even and at least 4, got 7"),
+        ("simple_dp3", {"n_inference_steps": 101}, "must be from 1 to n_training_steps = 100, got 101"),
+        ("flow", {"delta": 0.0}, "policy.delta must be between 0 and 1, got 0.0"),
+        ("flow", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),
+        ("mp1", {"horizon": 3}, "policy.horizon must be at least n_obs_steps"),
+    ],
+)
+def test_wrong_settings(name, changes, message):
+    with pytest.raises(UserError, match=message):
+        make(name, **changes)
