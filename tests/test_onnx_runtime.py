@@ -73,6 +73,12 @@ def test_tracing_knows_neither_autocast_nor_inference_mode():
     assert all(parameter.requires_grad and not parameter.is_inference() for parameter in network.parameters())
 
 
+def test_a_network_made_in_inference_mode():
+    with torch.inference_mode():
+        network, x = make_network(), torch.randn(2, 3)
+        torch.testing.assert_close(OnnxFunction(call)(network, x), network(x), atol=1e-5, rtol=0)
+
+
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda function: pickle.loads(pickle.dumps(function))])
 def test_it_can_be_copied_and_sent(duplicate):
     network, function, x = make_network(), OnnxFunction(call), torch.randn(2, 3)

@@ -40,16 +40,16 @@ class OnnxFunction:
         """The same as `eager(network, *inputs)` up to rounding. Inputs are float32 and on the CPU."""
         if network is not self._network or self._versions != [weight._version for weight in self._weights]:
             self._network = network
-            self._weights = [*network.parameters(), *network.buffers()]
+            weights = (*network.parameters(), *network.buffers())
+            self._weights = [weight for weight in weights if not weight.is_inference()]  # those nothing trains
             self._versions = [weight._version for weight in self._weights]
             self._sessions.clear()
         shapes = tuple(tensor.shape for tensor in inputs)
         if shapes not in self._sessions:
             names = [f"input_{index}" for index in range(len(inputs))]
             self._sessions[shapes] = _open(to_onnx(self.eager, network, shapes, names, "output"))
-        session = self._sessions[shapes]
-        feeds = {argument.name: tensor.numpy() for argument, tensor in zip(session.get_inputs(), inputs, strict=True)}
-        return torch.from_numpy(session.run(None, feeds)[0])
+        feeds = {f"input_{index}": tensor.numpy() for index, tensor in enumerate(inputs)}
+        return torch.from_numpy(self._sessions[shapes].run(["output"], feeds)[0])
 
 
 def to_onnx(

@@ -156,3 +156,13 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
 def test_wrong_settings(name, changes, message):
     with pytest.raises(UserError, match=message):
         make(name, **changes)
+
+
+@every_policy
+def test_onnx_runtime_computes_pytorchs_actions(variant):
+    fast, reference = make(variant, inference="onnxruntime").eval(), make(variant, inference="eager").eval()
+    noise = torch.randn(1, fast.config.horizon, N_ACTIONS)
+    for _ in range(2):
+        observation = make_observation()
+        actions = [policy.predict_action_chunk(observation, noise=noise) for policy in (fast, reference)]
+        torch.testing.assert_close(*actions, atol=1e-5, rtol=0)
