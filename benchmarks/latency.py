@@ -145,13 +145,6 @@ def draw() -> None:
             for x, value, top in zip(positions, median, p90, strict=True):
                 label = f"{value:.2g}" if value < 10 else f"{value:.0f}"
                 axis.annotate(label, (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
-                    f"{value:.2g}" if value < 10 else f"{value:.0f}",
-                    (x, top),
-                    (0, 2),
-                    textcoords="offset points",
-                    ha="center",
-                    fontsize=7,
-                )
         axis.set_xticks(np.arange(len(bars)) + 0.2, [bar["policy"].replace(" ", "\n") for bar in bars], fontsize=8)
         axis.set_yscale("log")
         axis.set_title(f"{n_threads} thread{'s' * (n_threads > 1)}", fontsize=10)
