@@ -64,7 +64,7 @@ def measure(task: str, sizes: dict[str, Any], n_steps: int) -> dict[str, list[fl
         casts.append(milliseconds)
         return hits
 
-    camera._caster.cast = cast
+    camera._caster.cast = cast  # type: ignore[method-assign, assignment]
     names = ("simulate", "rays", "crop", "sample", "to tensors", "preprocess", "plan", "queue", "postprocess", "step")
     stages: dict[str, list[float]] = {name: [] for name in names}
     for _ in range(n_steps + policy.config.n_action_steps):
