@@ -15,6 +15,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 import lerobot_policy_uca_flow  # noqa: F401  (registers everything, as LeRobot's commands do)
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from lerobot_uca.policies.modeling_base import PointCloudPolicy
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 N_POINTS, N_STATES, N_ACTIONS = 32, 9, 4
@@ -137,3 +138,25 @@ def dataset_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("data") / "random"
     write_dataset(root)
     return root
+
+
+def overfit(policy: PointCloudPolicy, n_steps: int) -> float:
+    """Train on one small batch; the error of the actions made for it, as a share of what it was."""
+    batch = make_batch(policy.config, batch_size=4)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3)
+
+    def error() -> float:
+        policy.eval()
+        chunk = policy.predict_action_chunk(batch)
+        policy.train()
+        return (chunk - batch["action"][:, policy.config.executed]).abs().mean().item()
+
+    before = error()
+    repeated = {key: value.repeat(8, *[1] * (value.ndim - 1)) for key, value in batch.items()}
+    for _ in range(n_steps):
+        loss, _ = policy.forward(repeated)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        policy.update()
+    return error() / before

@@ -4,8 +4,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
-from lerobot.envs import make_env, make_env_config, preprocess_observation
-from lerobot.envs.utils import env_to_policy_features
+from lerobot.envs import make_env_config
 
 from lerobot_uca.envs import adroit
 from lerobot_uca.envs.adroit import ARM, HAND, TASKS, AdroitPointCloudEnv, Outcome, make_simulator
@@ -126,37 +125,6 @@ def test_a_seed_gives_the_same_episode_in_any_order_and_another_seed_does_not(en
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
     assert not np.array_equal(first[0], other[0])
-
-
-@pytest.mark.parametrize("use_async_envs", [False, True])
-def test_vector_environments_give_the_episodes_of_single_ones(use_async_envs):
-    config = make_env_config("adroit_pointcloud", task="pen", n_points=64)
-    vector = make_env(config, n_envs=2, use_async_envs=use_async_envs)["pen"][0]
-    try:
-        observations, _ = vector.reset(seed=[5, 6])
-        assert vector.call("_max_episode_steps")[0] == 50
-        assert vector.call("task_description")[0] == TASKS["pen"].description
-        actions = np.full((2, 24), 0.5, dtype=np.float32)
-        stepped, *_, info = vector.step(actions)
-        assert info["is_success"].tolist() == [False, False]
-        assert vector.call("render")[0].shape == (320, 320, 3)
-    finally:
-        vector.close()
-    for index, seed in enumerate((5, 6)):
-        single = AdroitPointCloudEnv("pen", n_points=64)
-        observation, _ = single.reset(seed=seed)
-        np.testing.assert_array_equal(observations["point_cloud"][index], observation["point_cloud"])
-        np.testing.assert_array_equal(stepped["point_cloud"][index], single.step(actions[index])[0]["point_cloud"])
-
-
-def test_observations_reach_the_policy_under_the_features_names(env):
-    config = make_env_config("adroit_pointcloud", task=env.task)
-    batch = preprocess_observation(env.reset(seed=0)[0])
-    features = env_to_policy_features(config)
-    assert features["action"].shape == env.action_space.shape
-    for key, feature in features.items():
-        if key != "action":
-            assert tuple(batch[key].shape[-len(feature.shape) :]) == feature.shape
 
 
 def test_no_notice_and_no_opengl():

@@ -5,7 +5,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from tests.conftest import N_ACTIONS, SMALL_POLICIES, make_batch, make_observation, make_settings
+from tests.conftest import N_ACTIONS, SMALL_POLICIES, make_batch, make_observation, make_settings, overfit
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
@@ -116,25 +116,7 @@ def test_training_in_bfloat16(variant):
 
 @pytest.mark.parametrize(("name", "n_steps"), [("dp3", 50), ("flow", 150), ("mp1", 150)])
 def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
-    policy = make(name, unet_widths=(32, 64), ema_power=0.6)
-    batch = make_batch(policy.config, batch_size=4)
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3)
-
-    def error() -> float:
-        policy.eval()
-        chunk = policy.predict_action_chunk(batch)
-        policy.train()
-        return (chunk - batch["action"][:, policy.config.executed]).abs().mean().item()
-
-    before = error()
-    repeated = {key: value.repeat(8, *[1] * (value.ndim - 1)) for key, value in batch.items()}
-    for _ in range(n_steps):
-        loss, _ = policy.forward(repeated)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        policy.update()
-    assert error() < 0.4 * before
+    assert overfit(make(name, unet_widths=(32, 64), ema_power=0.6), n_steps) < 0.4
 
 
 @pytest.mark.parametrize(

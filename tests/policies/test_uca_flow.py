@@ -9,7 +9,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config, make_observation
+from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config, make_observation, overfit
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
@@ -238,25 +238,7 @@ def test_without_dual_pass_only_u_is_supervised():
 
 @pytest.mark.parametrize("dual_pass", [True, False])
 def test_overfitting_one_batch_drives_the_one_step_error_down(dual_pass):
-    policy = UCAFlowPolicy(make_config(dual_pass=dual_pass, ema_power=0.6))
-    batch = make_batch(policy.config, batch_size=4)
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3)
-
-    def error() -> float:
-        policy.eval()
-        chunk = policy.predict_action_chunk(batch)
-        policy.train()
-        return (chunk - batch["action"][:, policy.config.executed]).abs().mean().item()
-
-    before = error()
-    repeated = {key: value.repeat(8, *[1] * (value.ndim - 1)) for key, value in batch.items()}
-    for _ in range(400):
-        loss, _ = policy.forward(repeated)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        policy.update()
-    assert error() < 0.2 * before
+    assert overfit(UCAFlowPolicy(make_config(dual_pass=dual_pass, ema_power=0.6)), n_steps=400) < 0.2
 
 
 @pytest.mark.parametrize("conditioning", ["cross_attention", "adaln"])

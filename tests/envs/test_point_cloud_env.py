@@ -1,0 +1,44 @@
+"""What holds for every environment, as LeRobot's commands make it."""
+
+import numpy as np
+import pytest
+from lerobot.envs import make_env, make_env_config, preprocess_observation
+from lerobot.envs.utils import env_to_policy_features
+
+
+@pytest.mark.parametrize(
+    ("kind", "task", "n_actions", "episode_length"),
+    [("metaworld_pointcloud", "dial-turn", 4, 200), ("adroit_pointcloud", "pen", 24, 50)],
+)
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_vector_environments_give_the_episodes_of_single_ones(kind, task, n_actions, episode_length, use_async_envs):
+    config = make_env_config(kind, task=task, n_points=64)
+    vector = make_env(config, n_envs=2, use_async_envs=use_async_envs)[task][0]
+    try:
+        observations, _ = vector.reset(seed=[5, 6])
+        assert vector.call("_max_episode_steps")[0] == episode_length
+        assert vector.call("task")[0] == task
+        assert vector.call("task_description")[0] == config.task_description(task)
+        actions = np.full((2, n_actions), 0.5, dtype=np.float32)
+        stepped, *_, info = vector.step(actions)
+        assert info["is_success"].tolist() == [False, False]
+        assert vector.call("render")[0].shape == (320, 320, 3)
+    finally:
+        vector.close()
+    for index, seed in enumerate((5, 6)):
+        single = config.env_factory(task)()
+        observation, _ = single.reset(seed=seed)
+        np.testing.assert_array_equal(observations["point_cloud"][index], observation["point_cloud"])
+        np.testing.assert_array_equal(stepped["point_cloud"][index], single.step(actions[index])[0]["point_cloud"])
+
+
+@pytest.mark.parametrize(("kind", "task"), [("metaworld_pointcloud", "dial-turn"), ("adroit_pointcloud", "pen")])
+def test_observations_reach_the_policy_under_the_features_names(kind, task):
+    config = make_env_config(kind, task=task)
+    env = config.env_factory(task)()
+    batch = preprocess_observation(env.reset(seed=0)[0])
+    features = env_to_policy_features(config)
+    assert features["action"].shape == env.action_space.shape
+    for key, feature in features.items():
+        if key != "action":
+            assert tuple(batch[key].shape[-len(feature.shape) :]) == feature.shape
