@@ -5,6 +5,8 @@ import pytest
 from lerobot.envs import make_env, make_env_config, preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 
+from lerobot_uca.envs.point_cloud_env import PointCloudEnv
+
 
 @pytest.mark.parametrize(
     ("kind", "task", "n_actions", "episode_length"),
@@ -42,3 +44,30 @@ def test_observations_reach_the_policy_under_the_features_names(kind, task):
     for key, feature in features.items():
         if key != "action":
             assert tuple(batch[key].shape[-len(feature.shape) :]) == feature.shape
+
+
+SEEDED_TASKS = {
+    "metaworld_pointcloud": ("drawer-close", "assembly", "pick-place", "door-lock"),
+    "adroit_pointcloud": ("hammer", "door", "pen", "relocate"),
+}
+
+
+@pytest.mark.parametrize(("kind", "task"), [(kind, task) for kind, tasks in SEEDED_TASKS.items() for task in tasks])
+def test_a_seed_gives_the_same_episode_in_any_order_and_another_seed_does_not(kind, task):
+    make = make_env_config(kind, task=task, n_points=64).env_factory(task)
+    env = make()
+    first, other = rollout(env, 7), rollout(env, 8)
+    for a, b, c in zip(first, rollout(make(), 7), rollout(env, 7), strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+    assert not np.array_equal(first[0], other[0])
+
+
+def rollout(env: PointCloudEnv, seed: int, n_steps: int = 3) -> list[np.ndarray]:
+    observation, _ = env.reset(seed=seed)
+    arrays = [observation["point_cloud"], observation["agent_pos"]]
+    rng = np.random.default_rng(0)
+    for _ in range(n_steps):
+        observation, reward, *_ = env.step(rng.uniform(-1, 1, env.n_actions).astype(np.float32))
+        arrays += [observation["point_cloud"], observation["agent_pos"], np.array(reward)]
+    return arrays

@@ -209,13 +209,11 @@ class AdroitPointCloudEnv(PointCloudEnv):
         if self._simulator is None:
             self._simulator = make_simulator(self.task)
         simulator = self._simulator
-        self.expert_observation, _ = simulator.reset(seed=seed)
         state = (options or {}).get("initial_state_dict")
-        if state is not None:
-            if not simulator._state_space.contains(state):
-                fields, got = (_fields(arrays) for arrays in (simulator._state_space.sample(), state))
-                raise UserError(f"Adroit {self.task}: an initial state has {fields}, got {got}.")
-            self.expert_observation, _ = simulator.reset(seed=seed, options={"initial_state_dict": state})
+        if state is not None and not simulator._state_space.contains(state):
+            fields, got = (_fields(arrays) for arrays in (simulator._state_space.sample(), state))
+            raise UserError(f"Adroit {self.task}: an initial state has {fields}, got {got}.")
+        self.expert_observation, _ = simulator.reset(seed=seed, options=options)
         self._n_steps = 0
         return self._observe(), {"is_success": False}
 

@@ -69,17 +69,18 @@ class _RayCaster:
         """The nearest visible surface along each ray."""
         if model is not self._model:
             self._model = model
-            self._moves = model.body_weldid[model.geom_bodyid] != 0  # (ngeom,)
+            moves, is_visible = model.body_weldid[model.geom_bodyid] != 0, _is_visible(model)
+            self._fixed, self._moving = ~moves & is_visible, moves & is_visible  # (ngeom,)
             self._second_data = mujoco.MjData(model)
             self._fixed_poses = np.empty(0)
-        poses = np.hstack([data.geom_xpos, data.geom_xmat])[~self._moves & _is_visible(model)]
+        poses = np.hstack([data.geom_xpos, data.geom_xmat])[self._fixed]
         if not np.array_equal(poses, self._fixed_poses):
             self._fixed_poses = poses
             without_moving = copy(model)
-            without_moving.geom_group[self._moves] = HIDDEN_GROUP
+            without_moving.geom_group[self._moving] = HIDDEN_GROUP
             self._fixed_hits = self._cast(np.arange(len(self.directions)), without_moving, data, at_fixed=True)
         hits = self._fixed_hits.copy()
-        rays = self._rays_near(model, data, self._moves & _is_visible(model))
+        rays = self._rays_near(model, data)
         # Every other ray each, so that both meet as many surfaces. MuJoCo works in the data: each thread needs its own.
         first, second = rays[::2], rays[1::2]
         mujoco.mj_copyData(self._second_data, model, data)
@@ -88,10 +89,10 @@ class _RayCaster:
         hits.put_nearer(second, second_hits.result())
         return hits
 
-    def _rays_near(self, model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.bool_]) -> Indices:
-        """Which rays (R',) meet the bounding sphere of one of the geoms."""
-        to_centre = data.geom_xpos[geoms] - self.origin
-        tangent_squared = np.sum(to_centre**2, axis=1) - model.geom_rbound[geoms] ** 2
+    def _rays_near(self, model: mujoco.MjModel, data: mujoco.MjData) -> Indices:
+        """Which rays (R',) meet the bounding sphere of a geom that moves."""
+        to_centre = data.geom_xpos[self._moving] - self.origin
+        tangent_squared = np.sum(to_centre**2, axis=1) - model.geom_rbound[self._moving] ** 2
         # The rays that meet a sphere are those that make no larger an angle with its centre than its tangents do.
         tangent = np.where(tangent_squared > 0, np.sqrt(np.maximum(tangent_squared, 0)), -np.inf)
         # Geoms first, rays last: three times faster to reduce than the other way round.
