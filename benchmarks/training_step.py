@@ -104,7 +104,7 @@ def plain_step(policy: UCAFlowPolicy, batch: dict[str, torch.Tensor]) -> None:
     def refine_all(P: torch.Tensor, Y: torch.Tensor) -> torch.Tensor:
         tokens = torch.cat([P, Y], dim=1)
         for block in network.blocks:
-            tokens = block(tokens, n_out=tokens.shape[1])
+            tokens = block(tokens)
         return tokens[:, -Y.shape[1] :]
 
     network.refine = refine_all

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-from operator import call
 
 import pytest
 import torch
@@ -10,6 +9,10 @@ from torch import nn
 
 from lerobot_uca.networks.transformer import UnifiedTransformer
 from lerobot_uca.onnx_runtime import OnnxFunction
+
+
+def call(network: nn.Module, *inputs: torch.Tensor) -> tuple[torch.Tensor]:
+    return (network(*inputs),)
 
 
 def make_network(n_out: int = 4) -> nn.Module:
@@ -22,16 +25,15 @@ def test_a_transformer_gives_the_same_numbers(batch_size):
     network = UnifiedTransformer(**sizes, dim=64, n_layers=3, n_heads=4, n_interval_tokens=2).eval()
     z, o, ones = torch.randn(batch_size, 4, 4), torch.randn(batch_size, 2, 8), torch.ones(batch_size)
     with torch.no_grad():
-        torch.testing.assert_close(
-            OnnxFunction(call)(network, z, ones, ones, o), network(z, ones, ones, o), atol=1e-5, rtol=0
-        )
+        (computed,) = OnnxFunction(call)(network, z, ones, ones, o)
+        torch.testing.assert_close(computed, network(z, ones, ones, o), atol=1e-5, rtol=0)
 
 
 def test_one_function_serves_all_shapes():
     network, function = make_network(), OnnxFunction(call)
     for shape in ((1, 3), (5, 3), (2, 7, 3), (1, 3)):
         x = torch.randn(shape)
-        torch.testing.assert_close(function(network, x), network(x).detach(), atol=1e-5, rtol=0)
+        torch.testing.assert_close(function(network, x)[0], network(x).detach(), atol=1e-5, rtol=0)
     assert len(function._sessions) == 3
 
 
@@ -50,12 +52,12 @@ def test_changed_weights_are_noticed():
             torch._foreach_lerp_(list(network.parameters()), list(make_network().parameters()), 0.5)
 
     for change in (optimizer.step, load, average):
-        before = function(network, x)
+        (before,) = function(network, x)
         change()
-        after = function(network, x)
+        (after,) = function(network, x)
         assert not torch.allclose(after, before)
         torch.testing.assert_close(after, network(x).detach(), atol=1e-5, rtol=0)
-    torch.testing.assert_close(function(other, x), other(x).detach(), atol=1e-5, rtol=0)  # another network
+    torch.testing.assert_close(function(other, x)[0], other(x).detach(), atol=1e-5, rtol=0)  # another network
 
 
 @pytest.mark.parametrize("training", [True, False])
@@ -69,17 +71,17 @@ def test_tracing_knows_neither_autocast_nor_inference_mode():
     network, x = make_network(), torch.randn(2, 3)
     expected = network(x).detach()
     with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
-        torch.testing.assert_close(OnnxFunction(call)(network, x * 1), expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(OnnxFunction(call)(network, x * 1)[0], expected, atol=1e-5, rtol=0)
     assert all(parameter.requires_grad and not parameter.is_inference() for parameter in network.parameters())
 
 
 def test_a_network_made_in_inference_mode():
     with torch.inference_mode():
         network, x = make_network(), torch.randn(2, 3)
-        torch.testing.assert_close(OnnxFunction(call)(network, x), network(x), atol=1e-5, rtol=0)
+        torch.testing.assert_close(OnnxFunction(call)(network, x)[0], network(x), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda function: pickle.loads(pickle.dumps(function))])
 def test_it_can_be_copied_and_sent(duplicate):
     network, function, x = make_network(), OnnxFunction(call), torch.randn(2, 3)
-    assert torch.equal(duplicate(function)(network, x), function(network, x))
+    assert torch.equal(duplicate(function)(network, x)[0], function(network, x)[0])

@@ -100,7 +100,7 @@ def export(checkpoint: str, output: Path, *, overwrite: bool = False) -> dict[st
         raise UserError(f"'{output}' exists. Choose another --output, or replace it with --overwrite.")
     raw_policy = RawPolicy(checkpoint)
     shapes = raw_policy.input_shapes
-    model = to_onnx(raw_policy.act, raw_policy.policy, list(shapes.values()), list(shapes), "action")
+    model = to_onnx(raw_policy.act, raw_policy.policy, list(shapes.values()), list(shapes), ["action"])
     _check_same_actions(model, raw_policy)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)

@@ -15,6 +15,9 @@ from torch import Tensor, nn
 
 OPSET = 17  # the first with LayerNormalization
 
+Function = Callable[..., tuple[Tensor, ...]]
+"""function(network, *inputs)."""
+
 
 class OnnxFunction:
     """A function of a network and of tensors, computed by ONNX Runtime instead of PyTorch.
@@ -22,42 +25,52 @@ class OnnxFunction:
     The network is traced, which takes about a second, when it is first called with inputs of new shapes, and again
     when its weights have changed. The trace holds for all values of the inputs: the function must not branch on them.
 
+    One thread computes a sample: two are hardly faster, and now and then one waits for the other much longer than for
+    its work.
+
     Args:
-        eager: function(network, *inputs) in PyTorch: what is traced, and the reference.
+        eager: function(network, *inputs) in PyTorch: what is traced, and the reference. Returns a tuple.
     """
 
-    def __init__(self, eager: Callable[..., Tensor]) -> None:
+    def __init__(self, eager: Function) -> None:
         self.eager = eager
         self._network: nn.Module | None = None
-        self._weights: list[Tensor] = []
-        self._versions: list[int] = []
+        self._watched: Tensor | None = None
+        self._version = 0
         self._sessions: dict[tuple[torch.Size, ...], onnxruntime.InferenceSession] = {}
 
-    def __reduce__(self) -> tuple[type["OnnxFunction"], tuple[Callable[..., Tensor]]]:
+    def __reduce__(self) -> tuple[type["OnnxFunction"], tuple[Function]]:
         return OnnxFunction, (self.eager,)  # sessions can be neither copied nor sent to another process
 
-    def __call__(self, network: nn.Module, *inputs: Tensor) -> Tensor:
-        """The same as `eager(network, *inputs)` up to rounding. Inputs are float32 and on the CPU."""
-        if network is not self._network or self._versions != [weight._version for weight in self._weights]:
+    def __call__(self, network: nn.Module, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """The same as `eager(network, *inputs)` up to rounding. Inputs are float32, the first dimension is the batch.
+
+        PyTorch computes on other devices than the CPU and while the network is trained.
+        """
+        if network.training or inputs[0].device.type != "cpu":
+            return self.eager(network, *inputs)
+        if network is not self._network or (self._watched is not None and self._version != self._watched._version):
             self._network = network
-            weights = (*network.parameters(), *network.buffers())
-            self._weights = [weight for weight in weights if not weight.is_inference()]  # those nothing trains
-            self._versions = [weight._version for weight in self._weights]
+            # One weight stands for all: optimiser, averaging and loading change them together, and to look at a
+            # hundred takes 5 % of a small network's time. Those made in inference mode have no version: nothing trains.
+            self._watched = next((weight for weight in network.parameters() if not weight.is_inference()), None)
+            self._version = 0 if self._watched is None else self._watched._version
             self._sessions.clear()
         shapes = tuple(tensor.shape for tensor in inputs)
         if shapes not in self._sessions:
             names = [f"input_{index}" for index in range(len(inputs))]
-            self._sessions[shapes] = _open(to_onnx(self.eager, network, shapes, names, "output"))
+            model = to_onnx(self.eager, network, shapes, names)
+            self._sessions[shapes] = _open(model, n_threads=min(len(inputs[0]), torch.get_num_threads()))
         feeds = {f"input_{index}": tensor.numpy() for index, tensor in enumerate(inputs)}
-        return torch.from_numpy(self._sessions[shapes].run(["output"], feeds)[0])
+        return tuple(map(torch.from_numpy, self._sessions[shapes].run(None, feeds)))
 
 
 def to_onnx(
-    function: Callable[..., Tensor],
+    function: Callable[..., Tensor | tuple[Tensor, ...]],
     network: nn.Module,
     input_shapes: Sequence[Sequence[int]],
     input_names: Sequence[str],
-    output_name: str,
+    output_names: Sequence[str] = (),
 ) -> bytes:
     """function(network, *inputs) of float32 inputs of the given shapes as an ONNX model."""
     file = io.BytesIO()
@@ -73,7 +86,7 @@ def to_onnx(
             dynamo=False,
             opset_version=OPSET,
             input_names=list(input_names),
-            output_names=[output_name],
+            output_names=list(output_names),
         )
     return file.getvalue()
 
@@ -81,19 +94,19 @@ def to_onnx(
 class _Function(nn.Module):
     """What the exporter takes: a module."""
 
-    def __init__(self, function: Callable[..., Tensor], network: nn.Module) -> None:
+    def __init__(self, function: Callable[..., Tensor | tuple[Tensor, ...]], network: nn.Module) -> None:
         super().__init__()
         self.function = function
         self.network = network
         self.training = network.training  # the exporter sets both to what this one was
 
-    def forward(self, *inputs: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
         return self.function(self.network, *inputs)
 
 
-def _open(model: bytes) -> onnxruntime.InferenceSession:
+def _open(model: bytes, n_threads: int) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()
+    options.intra_op_num_threads = n_threads
     # Between calls the cores belong to others, to the simulator for example.
     options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 3

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import re
+import shutil
 
 import pytest
 import torch
@@ -102,10 +103,24 @@ def test_a_seed_reproduces_actions_and_losses(policy):
 )
 @pytest.mark.parametrize("batch_size", [1, 3])
 def test_onnx_runtime_gives_pytorchs_actions(changes, batch_size):
-    fast = UCAFlowPolicy(make_config(**changes)).eval()
-    reference = copy.deepcopy(fast)
-    reference.config = dataclasses.replace(fast.config, inference="eager")
-    for _ in range(7):
+    assert_acts_like_pytorch(UCAFlowPolicy(make_config(**changes)).eval(), batch_size)
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="torch.compile needs a C++ compiler")
+def test_torch_compile_gives_pytorchs_actions():
+    """On a GPU the same path records CUDA graphs."""
+    assert_acts_like_pytorch(UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval(), batch_size=2)
+
+
+def assert_acts_like_pytorch(fast, batch_size):
+    reference = UCAFlowPolicy(dataclasses.replace(fast.config, inference="eager")).eval()
+    reference.load_state_dict(fast.state_dict())
+    for step in range(10):
+        if step == 7:  # another average: what was traced or compiled must follow
+            for policy in (fast, reference):
+                with torch.no_grad():
+                    policy.model.generator.head[-1].bias.fill_(1.0)
+                policy.update()
         observation = make_observation(batch_size)
         noise = torch.randn(batch_size, fast.config.horizon, N_ACTIONS)
         actions = [policy.select_action(observation, noise=noise) for policy in (fast, reference)]
@@ -125,8 +140,8 @@ def test_trained_on_weights_are_used_by_the_next_plan(policy):
     )
 
 
-def test_a_frame_is_encoded_once_when_it_arrives_if_a_plan_will_see_it(policy):
-    policy.config.inference = "eager"
+def test_a_frame_is_encoded_once_when_it_arrives_if_a_plan_will_see_it():
+    policy = UCAFlowPolicy(make_config(inference="eager")).eval()
     calls: list[int] = []
     policy.ema_model.encoder.register_forward_hook(lambda *_: calls.append(1))
     n_encoded = []
@@ -134,7 +149,8 @@ def test_a_frame_is_encoded_once_when_it_arrives_if_a_plan_will_see_it(policy):
         before = len(calls)
         policy.select_action(make_observation())
         n_encoded.append(len(calls) - before)
-    assert n_encoded == [1, 0, 1, 1, 0, 1, 1]  # plans are made in steps 0, 3 and 6, from two frames
+    # Plans are made in steps 0, 3 and 6, from two frames. The first one also stands for the one before it.
+    assert n_encoded == [2, 0, 1, 1, 0, 1, 1]
 
 
 def test_a_policy_that_has_acted_can_be_copied(policy):
@@ -143,11 +159,11 @@ def test_a_policy_that_has_acted_can_be_copied(policy):
     duplicate = copy.deepcopy(policy)
     duplicate.reset()
     assert torch.equal(duplicate.predict_action_chunk(observation, noise=noise), expected)
-    assert duplicate._generate_function.eager.__self__ is duplicate
+    assert duplicate._plan.eager.__self__ is duplicate
 
 
-def test_one_network_call_makes_a_chunk(policy):
-    policy.config.inference = "eager"
+def test_one_network_call_makes_a_chunk():
+    policy = UCAFlowPolicy(make_config(inference="eager")).eval()
     calls = []
     policy.ema_model.generator.register_forward_hook(lambda *_: calls.append(1))
     policy.predict_action_chunk(make_observation())
@@ -199,7 +215,7 @@ def test_training_equals_the_plain_method(policy):
         ]
         tokens = torch.cat([*P, network.embed_action(z) + network.action_positions], dim=1)
         for block in network.blocks:
-            tokens = block(tokens, n_out=tokens.shape[1])
+            tokens = block(tokens)
         return network.head(tokens[:, -T:])
 
     torch.manual_seed(1)
@@ -324,7 +340,7 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
         ({"n_points": 0}, "policy.n_points must be at least 1 or null (all points), got 0"),
         ({"dtype": "float16"}, "policy.dtype must be float32 or bfloat16, got 'float16'"),
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
-        ({"inference": "tensorrt"}, "policy.inference must be eager or onnxruntime, got 'tensorrt'"),
+        ({"inference": "tensorrt"}, "policy.inference must be one of eager, onnxruntime, compile, got 'tensorrt'"),
         ({"n_layers": 0}, "policy.n_layers must be at least 1, got 0"),
         (
             {"conditioning": "film"},

@@ -25,10 +25,12 @@ class SelfAttention(nn.Module):
         self.qkv = nn.Linear(dim, 3 * dim)
         self.out = nn.Linear(dim, dim)
 
-    def forward(self, tokens: Tensor, n_out: int) -> Tensor:
-        """(B, S, D) to what the last n_out tokens get from all, (B, n_out, D)."""
+    def forward(self, tokens: Tensor, n_out: int | None = None) -> Tensor:
+        """(B, S, D) to what the last n_out tokens (without it all) get from all, (B, n_out, D)."""
         q, k, v = self.qkv(tokens).unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)  # (B, heads, S, d)
-        weights = torch.softmax((q[:, :, -n_out:] * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
+        if n_out is not None:
+            q = q[:, :, -n_out:]
+        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
         return self.out((weights @ v).transpose(1, 2).flatten(-2))
 
 
@@ -43,9 +45,10 @@ class Block(nn.Module):
             nn.LayerNorm(dim), nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim)
         )
 
-    def forward(self, tokens: Tensor, n_out: int) -> Tensor:
-        """(B, S, D) to the last n_out tokens, (B, n_out, D)."""
-        tokens = tokens[:, -n_out:] + self.attention(self.norm(tokens), n_out)
+    def forward(self, tokens: Tensor, n_out: int | None = None) -> Tensor:
+        """(B, S, D) to the last n_out tokens, without it to all, (B, n_out, D)."""
+        attended = self.attention(self.norm(tokens), n_out)
+        tokens = (tokens if n_out is None else tokens[:, -n_out:]) + attended
         return tokens + self.feed_forward(tokens)
 
 
@@ -110,5 +113,5 @@ class UnifiedTransformer(ConditionActionTransformer):
         tokens = torch.cat([P, Y], dim=1)
         *earlier, last = self.blocks
         for block in earlier:
-            tokens = block(tokens, n_out=tokens.shape[1])
+            tokens = block(tokens)
         return last(tokens, n_out=Y.shape[1])  # what nobody reads is not computed

@@ -9,6 +9,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.inference import INFERENCE
 
 
 @dataclass
@@ -45,8 +46,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # Features of a robot state (the baselines').
     n_state_features: int = 64
 
-    # What computes actions on a CPU: eager (PyTorch, the reference) or onnxruntime (the same to rounding, faster for
-    # small networks). On other devices it is always PyTorch.
+    # What computes actions, the same to rounding: eager (PyTorch, the reference), onnxruntime (on a CPU; faster for
+    # small networks; on other devices it is PyTorch) or compile (torch.compile, on a GPU with CUDA graphs).
     inference: str = "eager"
     # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). LeRobot also evaluates with it
     # during training; lerobot-eval uses float32 unless told policy.use_amp=true.
@@ -84,8 +85,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         if self.dtype not in ("float32", "bfloat16"):
             raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
 
-        if self.inference not in ("eager", "onnxruntime"):
-            raise UserError(f"policy.inference must be eager or onnxruntime, got '{self.inference}'.")
+        if self.inference not in INFERENCE:
+            raise UserError(f"policy.inference must be one of {', '.join(INFERENCE)}, got '{self.inference}'.")
 
     def validate_features(self) -> None:
         """Keep of the dataset's features what the policy uses: a cloud, a state and an action.
