@@ -6,6 +6,7 @@ Letters as in `transformer`.
 import torch
 from torch import Tensor, nn
 
+from lerobot_uca.networks.dual import LayerNorm, Linear
 from lerobot_uca.networks.transformer import ConditionActionTransformer, SelfAttention
 
 
@@ -17,10 +18,10 @@ class AdaLNBlock(nn.Module):
 
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
-        self.norm = nn.LayerNorm(dim, elementwise_affine=False)
+        self.norm = LayerNorm(dim, elementwise_affine=False)
         self.attention = SelfAttention(dim, n_heads)
-        self.feed_forward = nn.Sequential(nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
-        self.modulation = nn.Sequential(nn.SiLU(), nn.Linear(dim, 4 * dim))
+        self.feed_forward = nn.Sequential(Linear(dim, 2 * dim), nn.GELU(), Linear(2 * dim, dim))
+        self.modulation = nn.Sequential(nn.SiLU(), Linear(dim, 4 * dim))
         for parameter in self.modulation.parameters():  # training starts from a plain transformer
             nn.init.zeros_(parameter)
 

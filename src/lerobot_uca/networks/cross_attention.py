@@ -6,6 +6,7 @@ Letters as in `transformer`.
 import torch
 from torch import Tensor, nn
 
+from lerobot_uca.networks.dual import LayerNorm, Linear
 from lerobot_uca.networks.transformer import ConditionActionTransformer, SelfAttention
 
 
@@ -15,9 +16,9 @@ class CrossAttention(nn.Module):
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
         self.n_heads = n_heads
-        self.q = nn.Linear(dim, dim)
-        self.kv = nn.Linear(dim, 2 * dim)
-        self.out = nn.Linear(dim, dim)
+        self.q = Linear(dim, dim)
+        self.kv = Linear(dim, 2 * dim)
+        self.out = Linear(dim, dim)
 
     def forward(self, Y: Tensor, P: Tensor) -> Tensor:
         """Y (B, T, D) and P (B, S, D) to (B, T, D)."""
@@ -35,13 +36,11 @@ class CrossAttentionBlock(nn.Module):
 
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
-        self.norm = nn.LayerNorm(dim)
+        self.norm = LayerNorm(dim)
         self.attention = SelfAttention(dim, n_heads)
-        self.norm_actions, self.norm_conditions = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.norm_actions, self.norm_conditions = LayerNorm(dim), LayerNorm(dim)
         self.cross_attention = CrossAttention(dim, n_heads)
-        self.feed_forward = nn.Sequential(
-            nn.LayerNorm(dim), nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim)
-        )
+        self.feed_forward = nn.Sequential(LayerNorm(dim), Linear(dim, 2 * dim), nn.GELU(), Linear(2 * dim, dim))
 
     def forward(self, Y: Tensor, P: Tensor) -> Tensor:
         """Y (B, T, D) and P (B, S, D) to (B, T, D)."""

@@ -5,6 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from lerobot_uca.networks.dual import Linear
+
 
 class TimeEmbedding(nn.Module):
     """phi(PE(t)): a sinusoidal embedding followed by an MLP.
@@ -19,7 +21,7 @@ class TimeEmbedding(nn.Module):
         super().__init__()
         half = dim // 2
         self.register_buffer("frequencies", torch.exp(-math.log(10_000) * torch.arange(half) / half), persistent=False)
-        self.mlp = nn.Sequential(nn.Linear(2 * half, dim), nn.SiLU(), nn.Linear(dim, dim))
+        self.mlp = nn.Sequential(Linear(2 * half, dim), nn.SiLU(), Linear(dim, dim))
 
     def forward(self, t: Tensor) -> Tensor:
         """(B,) to (B, dim)."""

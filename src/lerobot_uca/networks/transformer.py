@@ -10,6 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from lerobot_uca.networks.dual import LayerNorm, Linear
 from lerobot_uca.networks.embeddings import TimeEmbedding
 
 
@@ -22,8 +23,8 @@ class SelfAttention(nn.Module):
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
         self.n_heads = n_heads
-        self.qkv = nn.Linear(dim, 3 * dim)
-        self.out = nn.Linear(dim, dim)
+        self.qkv = Linear(dim, 3 * dim)
+        self.out = Linear(dim, dim)
 
     def forward(self, tokens: Tensor, n_out: int | None = None) -> Tensor:
         """(B, S, D) to what the last n_out tokens (without it all) get from all, (B, n_out, D)."""
@@ -39,11 +40,9 @@ class Block(nn.Module):
 
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
-        self.norm = nn.LayerNorm(dim)
+        self.norm = LayerNorm(dim)
         self.attention = SelfAttention(dim, n_heads)
-        self.feed_forward = nn.Sequential(
-            nn.LayerNorm(dim), nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim)
-        )
+        self.feed_forward = nn.Sequential(LayerNorm(dim), Linear(dim, 4 * dim), nn.GELU(), Linear(4 * dim, dim))
 
     def forward(self, tokens: Tensor, n_out: int | None = None) -> Tensor:
         """(B, S, D) to the last n_out tokens, without it to all, (B, n_out, D)."""
@@ -75,16 +74,16 @@ class ConditionActionTransformer(nn.Module):
         n_interval_tokens: int,
     ) -> None:
         super().__init__()
-        self.embed_observation = nn.Linear(n_obs_features, dim)
+        self.embed_observation = Linear(n_obs_features, dim)
         self.embed_timestep = TimeEmbedding(dim)
         self.embed_interval = TimeEmbedding(dim)
-        self.embed_action = nn.Linear(n_actions, dim)
+        self.embed_action = Linear(n_actions, dim)
         self.observation_positions = nn.Parameter(0.02 * torch.randn(n_obs_steps, dim))
         self.timestep_biases = nn.Parameter(0.02 * torch.randn(n_timestep_tokens, dim))
         self.interval_biases = nn.Parameter(0.02 * torch.randn(n_interval_tokens, dim))
         self.action_positions = nn.Parameter(0.02 * torch.randn(horizon, dim))
         self.blocks = nn.ModuleList(self.block(dim, n_heads) for _ in range(n_layers))
-        self.head = nn.Sequential(nn.LayerNorm(dim), nn.Linear(dim, n_actions))
+        self.head = nn.Sequential(LayerNorm(dim), Linear(dim, n_actions))
 
     @abstractmethod
     def refine(self, P: Tensor, Y: Tensor) -> Tensor:
