@@ -14,7 +14,8 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 
 # What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
 ALLOWED = {
-    "policies": {"meanflow", "objectives", "networks", "onnx_runtime", "errors", "features"},
+    "policies": {"meanflow", "objectives", "networks", "inference", "errors", "features"},
+    "inference": {"onnx_runtime", "errors"},
     "objectives": {"meanflow", "networks"},
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},

@@ -35,7 +35,7 @@ class PointEncoder(nn.Module):
 
     def _largest(self, clouds: Tensor) -> Tensor:
         """(B, N, 3) to (B, C)."""
-        return torch.cat([self.per_point(some).amax(dim=1) for some in _some_at_once(clouds)])
+        return torch.cat([_largest_point(self.per_point(some)) for some in _some_at_once(clouds)])
 
     def _largest_of_winners(self, clouds: Tensor) -> Tensor:
         """The same with a graph to go back through."""
@@ -44,6 +44,14 @@ class PointEncoder(nn.Module):
         wins = torch.zeros(clouds.shape[:2], dtype=torch.bool, device=clouds.device).scatter_(1, winners, True)
         row = wins.flatten().cumsum(0).view_as(wins) - 1  # of a winner in the list of all winners
         return self.per_point(clouds[wins]).gather(0, row.gather(1, winners))
+
+
+def _largest_point(features: Tensor) -> Tensor:
+    """features.amax(dim=1), (B, N, C) to (B, C). Halves first: ONNX Runtime is slow at a maximum over a dimension."""
+    while features.shape[1] > 8:
+        half = (features.shape[1] + 1) // 2  # an odd one out is in both
+        features = torch.maximum(features[:, :half], features[:, -half:])
+    return features.amax(dim=1)
 
 
 def _some_at_once(clouds: Tensor) -> tuple[Tensor, ...]:

@@ -183,7 +183,7 @@ class PointCloudPolicy(PreTrainedPolicy):
         self._check_finite(batch, OBSERVATION_KEYS)
         model = self.active_model
         o = self._encode(model, batch)
-        return self._executed(self.generate(model.generator, self._noise_like(o, noise), o))
+        return self._checked(self._generate_executed(model.generator, self._noise_like(o, noise), o))
 
     @property
     def active_model(self) -> Model:
@@ -210,17 +210,20 @@ class PointCloudPolicy(PreTrainedPolicy):
         actions, newest.features = self._plan(
             self.active_model, newest.cloud, newest.state, noise, *map(self._features, earlier)
         )
-        return self._executed(actions)
+        return self._checked(actions)
 
     def _encode_and_generate(
         self, model: Model, cloud: Tensor, state: Tensor, noise: Tensor, *earlier: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Actions (B, T, A) and the newest frame's features (B, 1, F), from it and the features of earlier ones.
+        """The actions to execute and the newest frame's features (B, 1, F), from it and the features of earlier ones.
 
         One function, because between two a CPU loses as much time as a tenth of a small network takes.
         """
         newest = model.encoder(cloud, state)
-        return self.generate(model.generator, noise, torch.cat([*earlier, newest], dim=1)), newest
+        return self._generate_executed(model.generator, noise, torch.cat([*earlier, newest], dim=1)), newest
+
+    def _generate_executed(self, generator: nn.Module, noise: Tensor, o: Tensor) -> Tensor:
+        return self.generate(generator, noise, o)[:, self.config.executed]
 
     def _encode(self, model: Model, batch: Mapping[str, Tensor]) -> Tensor:
         cloud = batch[OBS_POINT_CLOUD][..., : self.config.n_points, :]
@@ -231,10 +234,10 @@ class PointCloudPolicy(PreTrainedPolicy):
             noise = torch.randn(len(values), self.config.horizon, self.config.n_actions, device=values.device)
         return noise
 
-    def _executed(self, actions: Tensor) -> Tensor:
+    def _checked(self, actions: Tensor) -> Tensor:
         if not _is_finite(actions):  # a robot must never get them
             self._raise_diverged()
-        return actions[:, self.config.executed]
+        return actions
 
     # Bad input --------------------------------------------------------------------------------------------------
 
