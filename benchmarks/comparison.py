@@ -69,15 +69,13 @@ def print_table() -> None:
     rows = read(RESULTS)
     print("| | " + " | ".join(f"{task}, {steps} steps" for task, steps in STEPS.items()) + " |")
     print("|---" * (len(STEPS) + 1) + "|")
-    for method in METHODS:
+    for method, arguments in METHODS.items():
         cells = []
-        for task in STEPS:
-            found = sorted(
-                (row["training_seed"], row["success_percent"])
-                for row in rows
-                if (row["name"], row["task"]) == (method, task)
-            )
-            ours = " and ".join(success for _, success in found) or "-"
+        for task, steps in STEPS.items():
+            values = (method, task, str(steps), str(FIRST_EVAL_SEED), " ".join(arguments))
+            same = dict(zip(("name", "task", "steps", "first_eval_seed", "arguments"), values, strict=True))
+            found = [(int(row["training_seed"]), row["success_percent"]) for row in rows if same.items() <= row.items()]
+            ours = " and ".join(success for _, success in sorted(found)) or "-"
             cells.append(f"{ours} ({PAPER[method].get(task, '-')})")
         print(f"| {method} | " + " | ".join(cells) + " |")
 

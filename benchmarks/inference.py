@@ -56,6 +56,7 @@ def main() -> None:
     for size in SIZES:
         for batch_size in args.batch_sizes:
             for name in args.computed_by:
+                torch._dynamo.reset()  # it compiles a function for so many shapes and no more
                 row = measure(make(size, name), batch_size, args.calls, peak, bandwidth)
                 table.writerow([size, name, batch_size, *(f"{value:.3f}" for value in row)])
                 sys.stdout.flush()

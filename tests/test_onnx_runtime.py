@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from lerobot_uca.networks.transformer import UnifiedTransformer
-from lerobot_uca.onnx_runtime import OnnxFunction
+from lerobot_uca.onnx_runtime import OnnxFunction, to_onnx
 
 
 def call(network: nn.Module, *inputs: torch.Tensor) -> tuple[torch.Tensor]:
@@ -51,7 +51,11 @@ def test_changed_weights_are_noticed():
         with torch.no_grad():
             torch._foreach_lerp_(list(network.parameters()), list(make_network().parameters()), 0.5)
 
-    for change in (optimizer.step, load, average):
+    def change_last() -> None:
+        with torch.no_grad():
+            network[-1].bias.add_(1)
+
+    for change in (optimizer.step, load, average, change_last):
         (before,) = function(network, x)
         change()
         (after,) = function(network, x)
@@ -63,8 +67,15 @@ def test_changed_weights_are_noticed():
 @pytest.mark.parametrize("training", [True, False])
 def test_tracing_leaves_the_networks_mode_alone(training):
     network = make_network().train(training)
-    OnnxFunction(call)(network, torch.randn(2, 3))
+    to_onnx(call, network, [(2, 3)], ["x"])
     assert all(module.training == training for module in network.modules())
+
+
+def test_pytorch_computes_while_a_network_is_trained():
+    network, function, x = make_network().train(), OnnxFunction(call), torch.randn(2, 3)
+    (result,) = function(network, x)
+    assert result.requires_grad
+    assert torch.equal(result, network(x))
 
 
 def test_tracing_knows_neither_autocast_nor_inference_mode():

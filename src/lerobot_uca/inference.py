@@ -5,7 +5,7 @@ from textwrap import shorten
 
 import torch
 from torch import Tensor, nn
-from torch._dynamo.exc import BackendCompilerFailed
+from torch._dynamo.exc import ShortenTraceback
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.onnx_runtime import Function, OnnxFunction
@@ -23,7 +23,7 @@ class CompiledFunction:
 
     def __init__(self, eager: Function) -> None:
         self.eager = eager
-        self._compiled = torch.compile(eager, mode="reduce-overhead", dynamic=False)
+        self._compiled = torch.compile(eager, mode="reduce-overhead", dynamic=False, fullgraph=True)
 
     def __reduce__(self) -> tuple[type["CompiledFunction"], tuple[Function]]:
         return CompiledFunction, (self.eager,)  # what is compiled can be neither copied nor sent to another process
@@ -37,7 +37,7 @@ class CompiledFunction:
         torch.compiler.cudagraph_mark_step_begin()
         try:
             results = self._compiled(network, *inputs)
-        except BackendCompilerFailed as error:
+        except ShortenTraceback as error:  # what compilers raise that fail or are not there
             reason = " ".join(str(error).split()).partition(" Set TORCHDYNAMO_VERBOSE")[0]
             raise UserError(
                 "policy.inference=compile needs a compiler, a C++ compiler on a CPU and Triton on a GPU; "

@@ -23,7 +23,8 @@ class OnnxFunction:
     """A function of a network and of tensors, computed by ONNX Runtime instead of PyTorch.
 
     The network is traced, which takes about a second, when it is first called with inputs of new shapes, and again
-    when its weights have changed. The trace holds for all values of the inputs: the function must not branch on them.
+    when its first or last weight was changed in place. The trace holds for all values of the inputs: the function must
+    not branch on them.
 
     One thread computes a sample: two are hardly faster, and now and then one waits for the other much longer than for
     its work.
@@ -35,8 +36,8 @@ class OnnxFunction:
     def __init__(self, eager: Function) -> None:
         self.eager = eager
         self._network: nn.Module | None = None
-        self._watched: Tensor | None = None
-        self._version = 0
+        self._watched: list[Tensor] = []
+        self._versions: list[int] = []
         self._sessions: dict[tuple[torch.Size, ...], onnxruntime.InferenceSession] = {}
 
     def __reduce__(self) -> tuple[type["OnnxFunction"], tuple[Function]]:
@@ -49,12 +50,13 @@ class OnnxFunction:
         """
         if network.training or inputs[0].device.type != "cpu":
             return self.eager(network, *inputs)
-        if network is not self._network or (self._watched is not None and self._version != self._watched._version):
+        if network is not self._network or self._versions != [weight._version for weight in self._watched]:
             self._network = network
-            # One weight stands for all: optimiser, averaging and loading change them together, and to look at a
-            # hundred takes 5 % of a small network's time. Those made in inference mode have no version: nothing trains.
-            self._watched = next((weight for weight in network.parameters() if not weight.is_inference()), None)
-            self._version = 0 if self._watched is None else self._watched._version
+            # Two weights stand for all: averaging and loading change them together, and to look at a hundred takes 5 %
+            # of a small network's time. Those made in inference mode have no version: nothing trains them.
+            weights = [weight for weight in network.parameters() if not weight.is_inference()]
+            self._watched = [*weights[:1], *weights[-1:]]
+            self._versions = [weight._version for weight in self._watched]
             self._sessions.clear()
         shapes = tuple(tensor.shape for tensor in inputs)
         if shapes not in self._sessions:

@@ -12,6 +12,7 @@ LAYERS = {
     "Linear": lambda: Linear(6, 4),
     "Linear without bias": lambda: Linear(6, 4, bias=False),
     "LayerNorm": lambda: LayerNorm(6),
+    "LayerNorm over two dimensions": lambda: LayerNorm((5, 6)),
     "LayerNorm without weights": lambda: LayerNorm(6, elementwise_affine=False),
 }
 
@@ -28,7 +29,8 @@ def plain(layer, x):
     """The layer in operations that PyTorch differentiates rightly as often as one likes, which its LayerNorm is not."""
     if isinstance(layer, Linear):
         return linear(x, layer.weight, layer.bias)
-    n = (x - x.mean(-1, keepdim=True)) / torch.sqrt(x.var(-1, correction=0, keepdim=True) + layer.eps)
+    dims = tuple(range(-len(layer.normalized_shape), 0))
+    n = (x - x.mean(dims, keepdim=True)) / torch.sqrt(x.var(dims, correction=0, keepdim=True) + layer.eps)
     return n if layer.weight is None else n * layer.weight + layer.bias
 
 

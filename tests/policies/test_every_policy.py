@@ -130,6 +130,7 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
         ("simple_dp3", {"unet_kernel_size": 4}, "policy.unet_kernel_size must be odd, got 4"),
         ("flow", {"time_dim": 7}, "policy.time_dim must be even and at least 4, got 7"),
         ("simple_dp3", {"n_inference_steps": 101}, "must be from 1 to n_training_steps = 100, got 101"),
+        ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be eager or onnxruntime"),
         ("flow", {"delta": 0.0}, "policy.delta must be between 0 and 1, got 0.0"),
         ("flow", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),
         ("mp1", {"horizon": 3}, "policy.horizon must be at least n_obs_steps"),

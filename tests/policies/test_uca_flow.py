@@ -112,6 +112,16 @@ def test_torch_compile_gives_pytorchs_actions():
     assert_acts_like_pytorch(UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval(), batch_size=2)
 
 
+def test_without_a_compiler(monkeypatch):
+    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, "/no/compiler"))
+    monkeypatch.setattr(torch._inductor.config, "force_disable_caches", True)
+    policy = UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval()
+    with pytest.raises(
+        UserError, match=r"needs a compiler.*onnxruntime and eager need none: .*No working C.. compiler"
+    ):
+        policy.predict_action_chunk(make_observation())
+
+
 def assert_acts_like_pytorch(fast, batch_size):
     reference = UCAFlowPolicy(dataclasses.replace(fast.config, inference="eager")).eval()
     reference.load_state_dict(fast.state_dict())
@@ -406,6 +416,12 @@ def test_a_checkpoint_of_another_policy_type(tmp_path):
     message = "needs a configuration or checkpoint of policy type 'uca_flow', got one of type 'act'"
     with pytest.raises(UserError, match=message):
         UCAFlowPolicy.from_pretrained(tmp_path)
+
+
+def test_finite_values_may_have_an_infinite_sum(policy):
+    cloud = torch.full((1, 1, N_POINTS, 3), 3e38)
+    assert cloud.sum() == torch.inf
+    policy._check_finite({OBS_POINT_CLOUD: cloud}, [OBS_POINT_CLOUD])
 
 
 def test_a_bad_frame_is_neither_remembered_nor_a_reason_to_forget(policy):

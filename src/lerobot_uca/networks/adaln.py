@@ -28,7 +28,7 @@ class AdaLNBlock(nn.Module):
     def forward(self, Y: Tensor, condition: Tensor) -> Tensor:
         """Y (B, T, D) and condition (B, D) to (B, T, D)."""
         scale_1, shift_1, scale_2, shift_2 = self.modulation(condition)[:, None].chunk(4, dim=-1)
-        Y = Y + self.attention(self.norm(Y) * (1 + scale_1) + shift_1, n_out=Y.shape[1])
+        Y = Y + self.attention(self.norm(Y) * (1 + scale_1) + shift_1)
         return Y + self.feed_forward(self.norm(Y) * (1 + scale_2) + shift_2)
 
 

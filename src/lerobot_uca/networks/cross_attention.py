@@ -44,7 +44,7 @@ class CrossAttentionBlock(nn.Module):
 
     def forward(self, Y: Tensor, P: Tensor) -> Tensor:
         """Y (B, T, D) and P (B, S, D) to (B, T, D)."""
-        Y = Y + self.attention(self.norm(Y), n_out=Y.shape[1])
+        Y = Y + self.attention(self.norm(Y))
         Y = Y + self.cross_attention(self.norm_actions(Y), self.norm_conditions(P))
         return Y + self.feed_forward(Y)
 

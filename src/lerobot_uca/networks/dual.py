@@ -35,10 +35,11 @@ class LayerNorm(nn.LayerNorm):
         x, tangent = forward_ad.unpack_dual(x)
         if tangent is None:
             return super().forward(x)
-        centred = x - x.mean(dim=-1, keepdim=True)
-        inverse_std = torch.rsqrt(centred.square().mean(dim=-1, keepdim=True) + self.eps)
+        dims = tuple(range(-len(self.normalized_shape), 0))
+        centred = x - x.mean(dims, keepdim=True)
+        inverse_std = torch.rsqrt(centred.square().mean(dims, keepdim=True) + self.eps)
         n = centred * inverse_std
-        change = tangent - tangent.mean(dim=-1, keepdim=True)
-        change = torch.addcmul(change, n, (n * tangent).mean(dim=-1, keepdim=True), value=-1)
+        change = tangent - tangent.mean(dims, keepdim=True)
+        change = torch.addcmul(change, n, (n * tangent).mean(dims, keepdim=True), value=-1)
         scale = inverse_std if self.weight is None else inverse_std * self.weight
         return forward_ad.make_dual(super().forward(x), change * scale)

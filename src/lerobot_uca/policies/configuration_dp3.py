@@ -27,3 +27,8 @@ class DP3Config(UNetPolicyConfig):
                 f"policy.n_inference_steps must be from 1 to n_training_steps = {self.n_training_steps}, "
                 f"got {self.n_inference_steps}."
             )
+        if self.inference == "compile":
+            raise UserError(
+                "policy.inference=compile is for policies of one network call (uca_flow, flow, mp1): the steps of "
+                f"'{self.type}' do not compile as one function. It must be eager or onnxruntime."
+            )
