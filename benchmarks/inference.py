@@ -1,7 +1,8 @@
-"""Milliseconds from a normalised observation to a chunk of actions on a CPU, by stage, beside the machine's floor.
+"""Milliseconds from a normalised observation to a chunk of actions, by stage, beside the machine's floor.
 
 python benchmarks/inference.py > benchmarks/results/inference.csv
 python benchmarks/inference.py --computed_by eager onnxruntime compile     # torch.compile needs a C++ compiler
+python benchmarks/inference.py --device=cuda --computed_by eager compile   # with CUDA graphs
 
 Each frame is encoded once, when it arrives: 'encode' is the newest frame's, 'generate' the actions from the features of
 a window. 'plan' is a whole call of the policy, both in one, with its checks. Beside each median stands how many times
@@ -47,9 +48,11 @@ def main() -> None:
     parser.add_argument("--batch_sizes", type=int, nargs="+", default=[1, 2, 64])
     parser.add_argument("--calls", type=int, default=300, help="timed calls of each")
     parser.add_argument("--computed_by", nargs="+", default=["eager", "onnxruntime"], choices=list(INFERENCE))
+    parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
+    torch.set_default_device(args.device)
     peak, bandwidth = matrix_product_peak(), reading_bandwidth()
-    machine = f"{torch.get_num_threads()} threads, {peak / 1e9:.0f} GFLOP/s, {bandwidth / 1e9:.1f} GB/s"
+    machine = f"{args.device}, {torch.get_num_threads()} threads, {peak / 1e9:.0f} GFLOP/s, {bandwidth / 1e9:.1f} GB/s"
     print(f"{machine}; times in ms, medians", file=sys.stderr)
     table = csv.writer(sys.stdout, lineterminator="\n")
     table.writerow([*COLUMNS, "plan p99"])
@@ -69,10 +72,11 @@ def make(size: str, computed_by: str) -> UCAFlowPolicy:
         "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
     }
     action = {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))}
+    device = str(torch.get_default_device())
     config = UCAFlowConfig(
-        device="cpu", input_features=features, output_features=action, inference=computed_by, **SIZES[size]
+        device=device, input_features=features, output_features=action, inference=computed_by, **SIZES[size]
     )
-    return UCAFlowPolicy(config).eval()
+    return UCAFlowPolicy(config).to(device).eval()
 
 
 @torch.inference_mode()
@@ -116,6 +120,8 @@ def times(function: Callable[[], Any], n_calls: int) -> list[float]:
     for _ in range(n_calls + 10):
         start = time.perf_counter()
         function()
+        if torch.get_default_device().type == "cuda":
+            torch.cuda.synchronize()
         milliseconds.append(1e3 * (time.perf_counter() - start))
     return milliseconds[10:]
 

@@ -5,7 +5,7 @@ from textwrap import shorten
 
 import torch
 from torch import Tensor, nn
-from torch._dynamo.exc import ShortenTraceback
+from torch._dynamo.exc import FailOnRecompileLimitHit, ShortenTraceback
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.onnx_runtime import Function, OnnxFunction
@@ -31,17 +31,23 @@ class CompiledFunction:
     def __call__(self, network: nn.Module, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The same as `eager(network, *inputs)` up to rounding.
 
+        PyTorch computes it operation by operation while the network is trained, and after eight shapes of inputs.
+
         Raises:
             UserError: if it cannot be compiled, for lack of a compiler for example.
         """
+        if network.training:
+            return self.eager(network, *inputs)
         torch.compiler.cudagraph_mark_step_begin()
         try:
             results = self._compiled(network, *inputs)
+        except FailOnRecompileLimitHit:
+            return self.eager(network, *inputs)
         except ShortenTraceback as error:  # what compilers raise that fail or are not there
             reason = " ".join(str(error).split()).partition(" Set TORCHDYNAMO_VERBOSE")[0]
             raise UserError(
-                "policy.inference=compile needs a compiler, a C++ compiler on a CPU and Triton on a GPU; "
-                f"onnxruntime and eager need none: {shorten(reason, 300)}"
+                "policy.inference=compile failed. It needs a C++ compiler on a CPU and Triton on a GPU, eager and "
+                f"onnxruntime need none: {shorten(reason, 300)}"
             ) from error
         return tuple(result.clone() for result in results)  # a CUDA graph writes its next results to the same place
 

@@ -141,6 +141,24 @@ def test_wrong_settings(name, changes, message):
         make(name, **changes)
 
 
+@pytest.mark.parametrize("variant", [name for name in VARIANTS if NETWORK_CALLS[VARIANTS[name][0]] == 1])
+def test_a_policy_of_one_network_call_compiles_as_one_function(variant):
+    policy = make(variant).eval()
+    config, observation = policy.config, make_observation()
+    frame = (observation["observation.point_cloud"][:, None], observation["observation.state"][:, None])
+    inputs = (
+        policy.ema_model,
+        *frame,
+        torch.randn(1, config.horizon, N_ACTIONS),
+        torch.randn(1, 1, config.n_obs_features),
+    )
+    torch._dynamo.reset()
+    compiled = torch.compile(policy._encode_and_generate, backend="eager", fullgraph=True, dynamic=False)
+    with torch.no_grad():
+        for got, expected in zip(compiled(*inputs), policy._encode_and_generate(*inputs), strict=True):
+            torch.testing.assert_close(got, expected)
+
+
 @every_policy
 def test_onnx_runtime_computes_pytorchs_actions(variant):
     fast, reference = make(variant, inference="onnxruntime").eval(), make(variant, inference="eager").eval()

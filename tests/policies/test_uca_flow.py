@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import os
 import re
 import shutil
 
@@ -11,10 +12,12 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config, make_observation, overfit
+from torch import nn
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.meanflow import sample_intervals
+from lerobot_uca.networks import dual
 from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
@@ -106,7 +109,7 @@ def test_onnx_runtime_gives_pytorchs_actions(changes, batch_size):
     assert_acts_like_pytorch(UCAFlowPolicy(make_config(**changes)).eval(), batch_size)
 
 
-@pytest.mark.skipif(shutil.which("c++") is None, reason="torch.compile needs a C++ compiler")
+@pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="torch.compile needs a C++ compiler")
 def test_torch_compile_gives_pytorchs_actions():
     """On a GPU the same path records CUDA graphs."""
     assert_acts_like_pytorch(UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval(), batch_size=2)
@@ -116,9 +119,7 @@ def test_without_a_compiler(monkeypatch):
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, "/no/compiler"))
     monkeypatch.setattr(torch._inductor.config, "force_disable_caches", True)
     policy = UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval()
-    with pytest.raises(
-        UserError, match=r"needs a compiler.*onnxruntime and eager need none: .*No working C"
-    ):
+    with pytest.raises(UserError, match=r"needs a C\+\+ compiler.* need none: .*No working C"):
         policy.predict_action_chunk(make_observation())
 
 
@@ -205,14 +206,16 @@ def test_loss_of_a_batch_is_the_mean_of_its_samples(policy):
         assert torch.equal(value, untouched[key]), f"forward changed {key}"
 
 
-def test_training_equals_the_plain_method(policy):
-    """No winners, no shared calls, no left-out tokens: the same loss and gradients, to rounding."""
+def test_training_equals_the_plain_method(policy, monkeypatch):
+    """No winners, no shared calls, no left-out tokens, PyTorch's own tangents: the same loss and gradients."""
     policy.train()
     batch = make_batch(policy.config, batch_size=8)
     torch.manual_seed(1)
     loss, _ = policy.forward(batch)
     loss.backward()
 
+    monkeypatch.setattr(dual.Linear, "forward", nn.Linear.forward)
+    monkeypatch.setattr(dual.LayerNorm, "forward", nn.LayerNorm.forward)
     config, encoder, network, x = policy.config, policy.model.encoder, policy.model.generator, batch["action"]
     pooled = torch.relu(encoder.points.per_point(batch[OBS_POINT_CLOUD])).amax(dim=-2)
     o = torch.cat([encoder.points.project(pooled), encoder.state(batch["observation.state"])], dim=-1)
@@ -422,6 +425,14 @@ def test_finite_values_may_have_an_infinite_sum(policy):
     cloud = torch.full((1, 1, N_POINTS, 3), 3e38)
     assert cloud.sum() == torch.inf
     policy._check_finite({OBS_POINT_CLOUD: cloud}, [OBS_POINT_CLOUD])
+
+
+def test_another_number_of_samples_needs_a_reset(policy):
+    policy.select_action(make_observation(1))
+    with pytest.raises(UserError, match=r"must have 1 samples, as since the last reset\(\), got 3"):
+        policy.select_action(make_observation(3))
+    policy.reset()
+    assert policy.select_action(make_observation(3)).shape == (3, N_ACTIONS)
 
 
 def test_a_bad_frame_is_neither_remembered_nor_a_reason_to_forget(policy):

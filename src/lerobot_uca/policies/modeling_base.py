@@ -194,6 +194,11 @@ class PointCloudPolicy(PreTrainedPolicy):
         observation = {key: _get(batch, key)[:, None] for key in OBSERVATION_KEYS}
         self._check_shapes(observation, n_obs=1)
         self._check_finite(observation, OBSERVATION_KEYS)
+        if self._history and len(self._history[-1].state) != len(observation[OBS_STATE]):
+            raise UserError(
+                f"The batch must have {len(self._history[-1].state)} samples, as since the last reset(), "
+                f"got {len(observation[OBS_STATE])}."
+            )
         frame = Frame(observation[OBS_POINT_CLOUD][..., : self.config.n_points, :], observation[OBS_STATE])
         n_missing = self.config.n_obs_steps if not self._history else 1
         self._history.extend([frame] * n_missing)
