@@ -50,8 +50,7 @@ def main() -> None:
     parser.add_argument("--computed_by", nargs="+", default=["eager", "onnxruntime"], choices=list(INFERENCE))
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
-    torch.set_default_device(args.device)
-    peak, bandwidth = matrix_product_peak(), reading_bandwidth()
+    peak, bandwidth = matrix_product_peak(args.device), reading_bandwidth(args.device)
     machine = f"{args.device}, {torch.get_num_threads()} threads, {peak / 1e9:.0f} GFLOP/s, {bandwidth / 1e9:.1f} GB/s"
     print(f"{machine}; times in ms, medians", file=sys.stderr)
     table = csv.writer(sys.stdout, lineterminator="\n")
@@ -60,19 +59,18 @@ def main() -> None:
         for batch_size in args.batch_sizes:
             for name in args.computed_by:
                 torch._dynamo.reset()  # it compiles a function for so many shapes and no more
-                row = measure(make(size, name), batch_size, args.calls, peak, bandwidth)
+                row = measure(make(size, name, args.device), batch_size, args.calls, peak, bandwidth)
                 table.writerow([size, name, batch_size, *(f"{value:.3f}" for value in row)])
                 sys.stdout.flush()
 
 
-def make(size: str, computed_by: str) -> UCAFlowPolicy:
+def make(size: str, computed_by: str, device: str = "cpu") -> UCAFlowPolicy:
     """An untrained policy: weights do not change the time."""
     features = {
         OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (CLOUD_POINTS, 3)),
         "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
     }
     action = {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))}
-    device = str(torch.get_default_device())
     config = UCAFlowConfig(
         device=device, input_features=features, output_features=action, inference=computed_by, **SIZES[size]
     )
@@ -82,14 +80,14 @@ def make(size: str, computed_by: str) -> UCAFlowPolicy:
 @torch.inference_mode()
 def measure(policy: UCAFlowPolicy, batch_size: int, n_calls: int, peak: float, bandwidth: float) -> list[float]:
     """The numbers of a row: COLUMNS from 'encode' on, and plan's 99th percentile."""
-    config = policy.config
+    config, device = policy.config, policy.config.device
     observation = {
-        OBS_POINT_CLOUD: torch.rand(batch_size, CLOUD_POINTS, 3),
-        "observation.state": torch.rand(batch_size, N_STATES),
+        OBS_POINT_CLOUD: torch.rand(batch_size, CLOUD_POINTS, 3, device=device),
+        "observation.state": torch.rand(batch_size, N_STATES, device=device),
     }
     frame = (observation[OBS_POINT_CLOUD][:, None, : config.n_points], observation["observation.state"][:, None])
-    noise = torch.randn(batch_size, config.horizon, config.n_actions)
-    o = torch.randn(batch_size, config.n_obs_steps, config.n_obs_features)
+    noise = torch.randn(batch_size, config.horizon, config.n_actions, device=device)
+    o = torch.randn(batch_size, config.n_obs_steps, config.n_obs_features, device=device)
     encoder, generator = policy.ema_model.encoder, policy.ema_model.generator
 
     def generate_one(generator: nn.Module, noise: Tensor, o: Tensor) -> tuple[Tensor]:
@@ -97,9 +95,9 @@ def measure(policy: UCAFlowPolicy, batch_size: int, n_calls: int, peak: float, b
 
     generate = INFERENCE[config.inference](generate_one)
     milliseconds = (
-        times(lambda: policy._encode_frame(encoder, *frame), n_calls),
-        times(lambda: generate(generator, noise, o), n_calls),
-        times(lambda: policy.predict_action_chunk(observation), n_calls),
+        times(lambda: policy._encode_frame(encoder, *frame), n_calls, device),
+        times(lambda: generate(generator, noise, o), n_calls, device),
+        times(lambda: policy.predict_action_chunk(observation), n_calls, device),
     )
     floors = [
         1e3 * max(flops(function) / peak, n_bytes(network) / bandwidth)
@@ -114,14 +112,14 @@ def measure(policy: UCAFlowPolicy, batch_size: int, n_calls: int, peak: float, b
     return [*(number for pair in pairs for number in pair), float(np.percentile(milliseconds[-1], 99))]
 
 
-def times(function: Callable[[], Any], n_calls: int) -> list[float]:
+def times(function: Callable[[], Any], n_calls: int, device: str) -> list[float]:
     """Milliseconds of each call, after a few to warm up."""
     milliseconds = []
     for _ in range(n_calls + 10):
         start = time.perf_counter()
         function()
-        if torch.get_default_device().type == "cuda":
-            torch.cuda.synchronize()
+        if device != "cpu":
+            torch.accelerator.synchronize()
         milliseconds.append(1e3 * (time.perf_counter() - start))
     return milliseconds[10:]
 
@@ -138,16 +136,16 @@ def n_bytes(network: nn.Module) -> int:
     return sum(parameter.nbytes for parameter in network.parameters())
 
 
-def matrix_product_peak(size: int = 2048) -> float:
+def matrix_product_peak(device: str, size: int = 2048) -> float:
     """The best rate of a square matrix product [FLOP/s]."""
-    a, b = torch.randn(2, size, size)
-    return 2 * size**3 / (min(times(lambda: a @ b, 10)) / 1e3)
+    a, b = torch.randn(2, size, size, device=device)
+    return 2 * size**3 / (min(times(lambda: a @ b, 10, device)) / 1e3)
 
 
-def reading_bandwidth(n_megabytes: int = 256) -> float:
+def reading_bandwidth(device: str, n_megabytes: int = 256) -> float:
     """The best rate of reading memory [bytes/s]."""
-    data = torch.ones(n_megabytes * 2**18)
-    return data.nbytes / (min(times(data.sum, 10)) / 1e3)
+    data = torch.ones(n_megabytes * 2**18, device=device)
+    return data.nbytes / (min(times(data.sum, 10, device)) / 1e3)
 
 
 if __name__ == "__main__":
