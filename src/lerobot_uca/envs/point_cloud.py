@@ -79,7 +79,7 @@ class Crop:
 def ray_sphere_distances(origin: Array, directions: Array, centre: Array, radius: float) -> Array:
     """Distances [m] from origin (3,) along unit directions (R, 3) to a sphere, (R,); inf for a miss."""
     to_centre = centre - origin
-    along = directions @ to_centre
+    along = np.einsum("rc,c->r", directions, to_centre)  # not by BLAS, see ray_casting.py
     half_chord_squared = radius**2 - (to_centre @ to_centre - along**2)
     hit = (half_chord_squared >= 0) & (along > 0)
     return np.where(hit, along - np.sqrt(np.maximum(half_chord_squared, 0)), np.inf)

@@ -61,6 +61,7 @@ class _RayCaster:
     def __init__(self, origin: Array, directions: Array, *, with_normals: bool) -> None:
         self.origin = origin
         self.directions = directions
+        self._transposed_directions = np.ascontiguousarray(directions.T)
         self._with_normals = with_normals
         self._second_thread = ThreadPoolExecutor(max_workers=1)  # starts with the first cast
         self._model: mujoco.MjModel | None = None
@@ -95,8 +96,10 @@ class _RayCaster:
         tangent_squared = np.sum(to_centre**2, axis=1) - model.geom_rbound[self._moving] ** 2
         # The rays that meet a sphere are those that make no larger an angle with its centre than its tangents do.
         tangent = np.where(tangent_squared > 0, np.sqrt(np.maximum(tangent_squared, 0)), -np.inf)
-        # Geoms first, rays last: three times faster to reduce than the other way round.
-        return np.flatnonzero(np.any(to_centre @ self.directions.T >= tangent[:, None], axis=0))
+        # Geoms first, rays last: three times faster to reduce than the other way round. No product by BLAS, whose
+        # second thread goes on spinning for milliseconds and takes its core from the second one here.
+        along = np.einsum("gc,cr->gr", to_centre, self._transposed_directions)
+        return np.flatnonzero(np.any(along >= tangent[:, None], axis=0))
 
     def _cast(self, rays: Indices, model: mujoco.MjModel, data: mujoco.MjData, *, at_fixed: bool) -> _Hits:
         hits = _Hits(
