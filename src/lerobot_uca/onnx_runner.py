@@ -23,7 +23,7 @@ class OnnxPolicy:
     Args:
         path: the file.
         seed: of the noise that actions are made from; without one it is drawn.
-        n_threads: cores to use; 0 for all. One is hardly slower, and its times vary less.
+        n_threads: cores to use; 0 for all. A small network is fastest with one.
 
     Raises:
         ValueError: if the file is not such a policy, or if an observation has a wrong shape or is not finite.
