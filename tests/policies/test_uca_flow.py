@@ -115,9 +115,8 @@ def test_torch_compile_gives_pytorchs_actions():
     assert_acts_like_pytorch(UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval(), batch_size=2)
 
 
-def test_without_a_compiler(monkeypatch):
-    monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, "/no/compiler"))
-    monkeypatch.setattr(torch._inductor.config, "force_disable_caches", True)
+@torch._inductor.config.patch({"cpp.cxx": (None, "/no/compiler"), "force_disable_caches": True})
+def test_without_a_compiler():
     policy = UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval()
     with pytest.raises(UserError, match=r"needs a C\+\+ compiler.* need none: .*No working C"):
         policy.predict_action_chunk(make_observation())
