@@ -49,13 +49,13 @@ def main() -> None:
     args = parser.parse_args(sys.argv[1:end])
     for_training = sys.argv[end + 1 :]
     logging.disable(logging.INFO)
-    dataset = collect(args.env, args.task, args.expert)
     for seed in args.seeds:
         values = (args.name, args.task, args.steps, seed, args.first_eval_seed, args.n_episodes)
         row = dict(zip(IDENTITY, (*map(str, values), " ".join([args.config, *for_training])), strict=True))
         if any(row.items() <= known.items() for known in read(args.results)):
             print("there:", row)
             continue
+        dataset = collect(args.env, args.task, args.expert)
         training = OUTPUT / f"{args.task}-{args.name}-{args.steps}-{seed}"
         start = time.monotonic()
         checkpoint = train(args.config, dataset, training, [f"--steps={args.steps}", f"--seed={seed}", *for_training])
