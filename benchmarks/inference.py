@@ -1,15 +1,15 @@
 """Milliseconds from a normalised observation to a chunk of actions, by stage, beside the machine's floor.
 
 python benchmarks/inference.py > benchmarks/results/inference.csv
-python benchmarks/inference.py --computed_by eager onnxruntime compile     # torch.compile needs a C++ compiler
+python benchmarks/inference.py --computed_by eager openvino compile        # torch.compile needs a C++ compiler
 python benchmarks/inference.py --device=cuda --computed_by eager compile   # with CUDA graphs
 
 Each frame is encoded once, when it arrives: 'encode' is the newest frame's, 'generate' the actions from the features of
 a window. 'plan' is a whole call of the policy, both in one, with its checks. Beside each median stands how many times
 the floor it is, and beside plan's the 99th percentile. The floor is the larger of two times: floating-point operations,
 counted by PyTorch, over the measured peak of a matrix product with all threads, and bytes of weights over the measured
-rate of reading memory. (A small network's weights stay in the cache, from where they come faster. ONNX Runtime computes
-a single sample in one thread.)
+rate of reading memory. (A small network's weights stay in the cache, from where they come faster; the small network's
+single sample is computed in one thread.) The peak is float32's, also beside bfloat16's times.
 """
 
 import argparse
@@ -33,6 +33,7 @@ from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 N_STATES, N_ACTIONS, CLOUD_POINTS = 9, 4, 512
 SIZES: dict[str, Any] = {"small": {"dim": 128, "n_points": 128}, "full": {"dim": 256, "n_points": 512}}
+RUNTIMES = ["eager", "onnxruntime", "openvino", "openvino_bfloat16"]
 STAGES = ("encode", "generate", "plan")
 COLUMNS = (
     "configuration",
@@ -47,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch_sizes", type=int, nargs="+", default=[1, 2, 64])
     parser.add_argument("--calls", type=int, default=300, help="timed calls of each")
-    parser.add_argument("--computed_by", nargs="+", default=["eager", "onnxruntime"], choices=list(INFERENCE))
+    parser.add_argument("--computed_by", nargs="+", default=RUNTIMES, choices=list(INFERENCE))
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
     peak, bandwidth = matrix_product_peak(args.device), reading_bandwidth(args.device)

@@ -15,13 +15,13 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 # What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
 ALLOWED = {
     "policies": {"meanflow", "objectives", "networks", "inference", "errors", "features"},
-    "inference": {"onnx_runtime", "errors"},
+    "inference": {"traced", "errors"},
     "objectives": {"meanflow", "networks"},
     "envs": {"errors", "features"},
     "data": {"envs", "errors", "features"},
     "terminal": {"errors"},
     "training": {"data", "policies", "errors"},
-    "export": {"policies", "onnx_runtime", "errors", "features"},
+    "export": {"policies", "traced", "errors", "features"},
     "commands": {"data", "export"},
 }
 

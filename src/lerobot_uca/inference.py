@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch._dynamo.exc import FailOnRecompileLimitHit, ShortenTraceback
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.onnx_runtime import Function, OnnxFunction
+from lerobot_uca.traced import BFloat16Function, Function, OnnxFunction, OpenVinoFunction
 
 
 class CompiledFunction:
@@ -47,13 +47,15 @@ class CompiledFunction:
             reason = " ".join(str(error).split()).partition(" Set TORCHDYNAMO_VERBOSE")[0]
             raise UserError(
                 "policy.inference=compile failed. It needs a C++ compiler on a CPU and Triton on a GPU, eager and "
-                f"onnxruntime need none: {shorten(reason, 300)}"
+                f"openvino need none: {shorten(reason, 300)}"
             ) from error
         return tuple(result.clone() for result in results)  # a CUDA graph writes its next results to the same place
 
 
 INFERENCE: dict[str, Callable[[Function], Function]] = {
     "eager": lambda function: function,
+    "openvino": OpenVinoFunction,
+    "openvino_bfloat16": BFloat16Function,
     "onnxruntime": OnnxFunction,
     "compile": CompiledFunction,
 }

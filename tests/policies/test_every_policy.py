@@ -85,7 +85,7 @@ def test_each_sample_has_its_loss_and_padded_actions_do_not_count(variant):
 
 @every_policy
 def test_actions_have_the_right_shape_and_take_the_stated_number_of_network_calls(variant):
-    policy = make(variant, inference="eager").eval()  # ONNX Runtime calls what it has traced
+    policy = make(variant, inference="eager").eval()  # a runtime calls what was traced
     calls = []
     policy.ema_model.generator.register_forward_hook(lambda *_: calls.append(1))
     actions = [policy.select_action(make_observation(2)) for _ in range(4)]
@@ -130,7 +130,7 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
         ("simple_dp3", {"unet_kernel_size": 4}, "policy.unet_kernel_size must be odd, got 4"),
         ("flow", {"time_dim": 7}, "policy.time_dim must be even and at least 4, got 7"),
         ("simple_dp3", {"n_inference_steps": 101}, "must be from 1 to n_training_steps = 100, got 101"),
-        ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be eager or onnxruntime"),
+        ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be one of eager, openvino, "),
         ("flow", {"delta": 0.0}, "policy.delta must be between 0 and 1, got 0.0"),
         ("flow", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),
         ("mp1", {"horizon": 3}, "policy.horizon must be at least n_obs_steps"),
@@ -160,10 +160,12 @@ def test_a_policy_of_one_network_call_compiles_as_one_function(variant):
 
 
 @every_policy
-def test_onnx_runtime_computes_pytorchs_actions(variant):
-    fast, reference = make(variant, inference="onnxruntime").eval(), make(variant, inference="eager").eval()
+@pytest.mark.parametrize("inference", ["openvino", "onnxruntime"])
+def test_a_runtime_computes_pytorchs_actions(variant, inference, caplog):
+    fast, reference = make(variant, inference=inference).eval(), make(variant, inference="eager").eval()
     noise = torch.randn(1, fast.config.horizon, N_ACTIONS)
     for _ in range(2):
         observation = make_observation()
         actions = [policy.predict_action_chunk(observation, noise=noise) for policy in (fast, reference)]
         torch.testing.assert_close(*actions, atol=1e-5, rtol=0)
+    assert not caplog.records  # PyTorch did not step in

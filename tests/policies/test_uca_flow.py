@@ -105,8 +105,9 @@ def test_a_seed_reproduces_actions_and_losses(policy):
     "changes", [{}, {"n_points": 10}, {"n_obs_steps": 1, "horizon": 3}, {"dim": 64, "n_layers": 4}]
 )
 @pytest.mark.parametrize("batch_size", [1, 3])
-def test_onnx_runtime_gives_pytorchs_actions(changes, batch_size):
+def test_the_default_runtime_gives_pytorchs_actions(changes, batch_size, caplog):
     assert_acts_like_pytorch(UCAFlowPolicy(make_config(**changes)).eval(), batch_size)
+    assert not caplog.records  # PyTorch did not step in
 
 
 @pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="torch.compile needs a C++ compiler")
@@ -352,7 +353,10 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
         ({"n_points": 0}, "policy.n_points must be at least 1 or null (all points), got 0"),
         ({"dtype": "float16"}, "policy.dtype must be float32 or bfloat16, got 'float16'"),
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
-        ({"inference": "tensorrt"}, "policy.inference must be one of eager, onnxruntime, compile, got 'tensorrt'"),
+        (
+            {"inference": "tensorrt"},
+            "policy.inference must be one of eager, openvino, openvino_bfloat16, onnxruntime, compile",
+        ),
         ({"n_layers": 0}, "policy.n_layers must be at least 1, got 0"),
         (
             {"conditioning": "film"},

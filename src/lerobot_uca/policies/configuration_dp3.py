@@ -6,6 +6,7 @@ from typing import override
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.inference import INFERENCE
 from lerobot_uca.policies.configuration_unet import UNetPolicyConfig
 
 
@@ -28,7 +29,8 @@ class DP3Config(UNetPolicyConfig):
                 f"got {self.n_inference_steps}."
             )
         if self.inference == "compile":
+            others = ", ".join(name for name in INFERENCE if name != "compile")
             raise UserError(
                 "policy.inference=compile is for policies of one network call (uca_flow, flow, mp1): the steps of "
-                f"'{self.type}' do not compile as one function. It must be eager or onnxruntime."
+                f"'{self.type}' do not compile as one function. It must be one of {others}."
             )

@@ -34,7 +34,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # same size).
     conditioning: str = "unified"
     # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
-    inference: str = "onnxruntime"
+    inference: str = "openvino"
 
     # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
     dual_pass: bool = True

@@ -1,0 +1,196 @@
+"""Networks as OpenVINO or ONNX Runtime compute them on a CPU: the fast path of inference.
+
+A step of a small network is mostly Python, small operations and reading weights. These runtimes have none of the first,
+merge the second, compute once what does not depend on the inputs (the tokens of t = h = 1), and come as wheels, so
+that no compiler is needed. Both read the ONNX model that PyTorch's tracing makes, which is also what
+`lerobot-uca-export` writes.
+"""
+
+import io
+import logging
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import ClassVar, override
+
+import numpy as np
+import onnxruntime
+import openvino
+import torch
+from torch import Tensor, nn
+
+logger = logging.getLogger(__name__)
+
+OPSET = 17  # the first with LayerNormalization
+WEIGHTS_PER_THREAD = 900_000
+"""A second thread pays from about twice so many weights, those of all samples of a batch counted together."""
+
+Function = Callable[..., tuple[Tensor, ...]]
+"""function(network, *inputs)."""
+Run = Callable[[Sequence[Tensor]], tuple[Tensor, ...]]
+"""A trace, opened by a runtime: float32 inputs to results."""
+
+
+class TracedFunction(ABC):
+    """A function of a network and of tensors, computed by a runtime instead of PyTorch.
+
+    The network is traced, which takes about a second, when it is first called with inputs of new shapes, and again
+    when its first or last weight was changed in place. The trace holds for all values of the inputs: the function must
+    not branch on them. What the runtime makes of it is compared with PyTorch once; if it differs, PyTorch goes on.
+
+    Args:
+        eager: function(network, *inputs) in PyTorch: what is traced, and the reference. Returns a tuple.
+    """
+
+    runtime: ClassVar[str]
+    tolerance: ClassVar[float] = 1e-4
+    """How far results may be from PyTorch's, as a share of the largest: float32's rounding is far below."""
+
+    def __init__(self, eager: Function) -> None:
+        self.eager = eager
+        self._network: nn.Module | None = None
+        self._watched: list[Tensor] = []
+        self._versions: list[int] = []
+        self._traces: dict[tuple[torch.Size, ...], Run] = {}
+
+    def __reduce__(self) -> tuple[type["TracedFunction"], tuple[Function]]:
+        return type(self), (self.eager,)  # traces can be neither copied nor sent to another process
+
+    @abstractmethod
+    def open(self, model: bytes, input_shapes: Sequence[torch.Size], n_threads: int) -> Run:
+        """What computes an ONNX model, whose inputs are in order."""
+
+    def __call__(self, network: nn.Module, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """The same as `eager(network, *inputs)` up to rounding. Inputs are float32, the first dimension is the batch.
+
+        PyTorch computes on other devices than the CPU and while the network is trained.
+        """
+        if network.training or inputs[0].device.type != "cpu":
+            return self.eager(network, *inputs)
+        if network is not self._network or self._versions != [weight._version for weight in self._watched]:
+            self._network = network
+            # Two weights stand for all: averaging and loading change them together, and to look at a hundred takes 5 %
+            # of a small network's time. Those made in inference mode have no version: nothing trains them.
+            weights = [weight for weight in network.parameters() if not weight.is_inference()]
+            self._watched = [*weights[:1], *weights[-1:]]
+            self._versions = [weight._version for weight in self._watched]
+            self._traces.clear()
+        shapes = tuple(tensor.shape for tensor in inputs)
+        if shapes not in self._traces:
+            self._traces[shapes] = self._trace(network, shapes)
+        return self._traces[shapes](inputs)
+
+    def _trace(self, network: nn.Module, shapes: Sequence[torch.Size]) -> Run:
+        model = to_onnx(self.eager, network, shapes, [f"input_{index}" for index in range(len(shapes))])
+        n_weights = sum(weight.numel() for weight in network.parameters())
+        n_threads = max(1, min(torch.get_num_threads(), n_weights * shapes[0][0] // WEIGHTS_PER_THREAD))
+        run = self.open(model, shapes, n_threads)
+        generator = torch.Generator().manual_seed(0)
+        inputs = [torch.rand(shape, generator=generator) for shape in shapes]
+        with torch.no_grad(), torch.autocast("cpu", enabled=False):
+            pairs = list(zip(run(inputs), self.eager(network, *inputs), strict=True))
+        if all((got - expected).abs().max() <= self.tolerance * expected.abs().max() for got, expected in pairs):
+            return run
+        logger.warning("%s computes something else than PyTorch on this machine; PyTorch is used.", self.runtime)
+        return lambda inputs: self.eager(network, *inputs)
+
+
+class OnnxFunction(TracedFunction):
+    """Computed by ONNX Runtime."""
+
+    runtime = f"ONNX Runtime {onnxruntime.__version__}"
+
+    @override
+    def open(self, model: bytes, input_shapes: Sequence[torch.Size], n_threads: int) -> Run:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = n_threads
+        # Between calls the cores belong to others, to the simulator for example.
+        options.add_session_config_entry("session.force_spinning_stop", "1")
+        options.log_severity_level = 3
+        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        names = [tensor.name for tensor in session.get_inputs()]
+
+        def run(inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+            feeds = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
+            return tuple(map(torch.from_numpy, session.run(None, feeds)))
+
+        return run
+
+
+class OpenVinoFunction(TracedFunction):
+    """Computed by OpenVINO."""
+
+    runtime = f"OpenVINO {openvino.__version__}"
+    precision: ClassVar[str] = "f32"
+
+    @override
+    def open(self, model: bytes, input_shapes: Sequence[torch.Size], n_threads: int) -> Run:
+        settings = {
+            "INFERENCE_PRECISION_HINT": self.precision,
+            "INFERENCE_NUM_THREADS": n_threads,
+            "NUM_STREAMS": 1,
+            # Its fused attention gives wrong numbers where fewer tokens ask than answer, as in the last block (2025.4
+            # and 2026.4); the operations one by one take as long.
+            "SNIPPETS_MODE": "DISABLE",
+        }
+        core = openvino.Core()
+        request = core.compile_model(core.read_model(model), "CPU", settings).create_infer_request()
+        held = [np.empty(shape, np.float32) for shape in input_shapes]
+        for index, array in enumerate(held):
+            request.set_input_tensor(index, openvino.Tensor(array, shared_memory=True))
+        results = [tensor.data for tensor in request.output_tensors]
+
+        def run(inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+            # NumPy copies: a thread that PyTorch has just used would spin on the core that OpenVINO's second one needs.
+            for array, tensor in zip(held, inputs, strict=True):
+                array[...] = tensor.numpy()
+            request.infer(share_outputs=True)
+            return tuple(torch.from_numpy(result.copy()) for result in results)  # the next call overwrites them
+
+        return run
+
+
+class BFloat16Function(OpenVinoFunction):
+    """Computed by OpenVINO in bfloat16 where the processor has instructions for it: less exact, faster."""
+
+    precision = "bf16"
+    tolerance = 0.05
+
+
+def to_onnx(
+    function: Callable[..., Tensor | tuple[Tensor, ...]],
+    network: nn.Module,
+    input_shapes: Sequence[Sequence[int]],
+    input_names: Sequence[str],
+    output_names: Sequence[str] = (),
+) -> bytes:
+    """function(network, *inputs) of float32 inputs of the given shapes as an ONNX model."""
+    file = io.BytesIO()
+    # LeRobot calls policies in inference mode and under autocast; a trace must know neither.
+    with torch.inference_mode(False), torch.no_grad(), torch.autocast("cpu", enabled=False), warnings.catch_warnings():
+        # PyTorch's newer exporter takes ten times as long and needs one more package; the older one warns of its age
+        # and of sizes becoming constants, which they are.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            _Function(function, network),
+            tuple(torch.zeros(*shape) for shape in input_shapes),
+            file,  # type: ignore[arg-type]  # a file in memory will do
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=list(input_names),
+            output_names=list(output_names),
+        )
+    return file.getvalue()
+
+
+class _Function(nn.Module):
+    """What the exporter takes: a module."""
+
+    def __init__(self, function: Callable[..., Tensor | tuple[Tensor, ...]], network: nn.Module) -> None:
+        super().__init__()
+        self.function = function
+        self.network = network
+        self.training = network.training  # the exporter sets both to what this one was
+
+    def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
+        return self.function(self.network, *inputs)

@@ -1,0 +1,144 @@
+"""OpenVINO and ONNX Runtime compute what PyTorch computes, always with the network's present weights."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from torch import nn
+
+from lerobot_uca.networks.transformer import UnifiedTransformer
+from lerobot_uca.traced import BFloat16Function, OnnxFunction, OpenVinoFunction, to_onnx
+
+every_runtime = pytest.mark.parametrize("runtime", [OpenVinoFunction, OnnxFunction])
+
+
+def call(network: nn.Module, *inputs: torch.Tensor) -> tuple[torch.Tensor]:
+    return (network(*inputs),)
+
+
+def make_network(n_out: int = 4) -> nn.Module:
+    return nn.Sequential(nn.Linear(3, 16), nn.LayerNorm(16), nn.GELU(), nn.Linear(16, n_out)).eval()
+
+
+@pytest.mark.parametrize("batch_size", [1, 3, 64])
+@pytest.mark.parametrize(
+    ("runtime", "tolerance"), [(OpenVinoFunction, 1e-5), (OnnxFunction, 1e-5), (BFloat16Function, 0.05)]
+)
+def test_a_transformer_gives_the_same_numbers(runtime, tolerance, batch_size, caplog):
+    sizes = {"horizon": 4, "n_actions": 4, "n_obs_steps": 2, "n_obs_features": 8, "n_timestep_tokens": 2}
+    network = UnifiedTransformer(**sizes, dim=64, n_layers=3, n_heads=4, n_interval_tokens=2).eval()
+    z, o, ones = torch.randn(batch_size, 4, 4), torch.randn(batch_size, 2, 8), torch.ones(batch_size)
+    with torch.no_grad():
+        (computed,) = runtime(call)(network, z, ones, ones, o)
+        torch.testing.assert_close(computed, network(z, ones, ones, o), atol=tolerance, rtol=0)
+    assert not caplog.records  # PyTorch did not step in
+
+
+@every_runtime
+def test_where_a_runtime_goes_wrong_pytorch_steps_in(runtime, monkeypatch, caplog):
+    monkeypatch.setattr(runtime, "tolerance", -1.0)  # nothing is close enough
+    network, function, x = make_network(), runtime(call), torch.randn(2, 3)
+    for _ in range(2):
+        with torch.no_grad():
+            assert torch.equal(function(network, x)[0], network(x))
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{runtime.runtime} computes something else than PyTorch on this machine; PyTorch is used."
+    ]
+
+
+@every_runtime
+def test_results_are_not_overwritten_by_the_next_call(runtime):
+    network, function = make_network(), runtime(call)
+    (first,) = function(network, torch.zeros(1, 3))
+    kept = first.clone()
+    function(network, torch.ones(1, 3))
+    assert torch.equal(first, kept)
+
+
+def test_threads_follow_the_work(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        OnnxFunction, "open", lambda self, model, shapes, n_threads: asked.append(n_threads) or self.run
+    )
+    monkeypatch.setattr(OnnxFunction, "run", lambda self, inputs: (network(*inputs),), raising=False)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    network = nn.Linear(1000, 900, bias=False).eval()  # as many weights as one thread has
+    for batch_size in (1, 2, 64):
+        OnnxFunction(call)(network, torch.zeros(batch_size, 1000))
+    assert asked == [1, 2, 4]
+
+
+@every_runtime
+def test_one_function_serves_all_shapes(runtime):
+    network, function = make_network(), runtime(call)
+    for shape in ((1, 3), (5, 3), (2, 7, 3), (1, 3)):
+        x = torch.randn(shape)
+        torch.testing.assert_close(function(network, x)[0], network(x).detach(), atol=1e-5, rtol=0)
+    assert len(function._traces) == 3
+
+
+@every_runtime
+def test_changed_weights_are_noticed(runtime):
+    network, function, x = make_network(), runtime(call), torch.randn(2, 3)
+    function(network, x)
+    optimizer = torch.optim.SGD(network.parameters(), lr=1.0)
+    network(x).square().sum().backward()
+    other = make_network()
+
+    def load() -> None:
+        network.load_state_dict(other.state_dict())
+
+    def average() -> None:
+        with torch.no_grad():
+            torch._foreach_lerp_(list(network.parameters()), list(make_network().parameters()), 0.5)
+
+    def change_last() -> None:
+        with torch.no_grad():
+            network[-1].bias.add_(1)
+
+    for change in (optimizer.step, load, average, change_last):
+        (before,) = function(network, x)
+        change()
+        (after,) = function(network, x)
+        assert not torch.allclose(after, before)
+        torch.testing.assert_close(after, network(x).detach(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(function(other, x)[0], other(x).detach(), atol=1e-5, rtol=0)  # another network
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_tracing_leaves_the_networks_mode_alone(training):
+    network = make_network().train(training)
+    to_onnx(call, network, [(2, 3)], ["x"])
+    assert all(module.training == training for module in network.modules())
+
+
+@every_runtime
+def test_pytorch_computes_while_a_network_is_trained(runtime):
+    network, function, x = make_network().train(), runtime(call), torch.randn(2, 3)
+    (result,) = function(network, x)
+    assert result.requires_grad
+    assert torch.equal(result, network(x))
+
+
+@every_runtime
+def test_tracing_knows_neither_autocast_nor_inference_mode(runtime):
+    network, x = make_network(), torch.randn(2, 3)
+    expected = network(x).detach()
+    with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(runtime(call)(network, x * 1)[0], expected, atol=1e-5, rtol=0)
+    assert all(parameter.requires_grad and not parameter.is_inference() for parameter in network.parameters())
+
+
+@every_runtime
+def test_a_network_made_in_inference_mode(runtime):
+    with torch.inference_mode():
+        network, x = make_network(), torch.randn(2, 3)
+        torch.testing.assert_close(runtime(call)(network, x)[0], network(x), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda function: pickle.loads(pickle.dumps(function))])
+@every_runtime
+def test_it_can_be_copied_and_sent(runtime, duplicate):
+    network, function, x = make_network(), runtime(call), torch.randn(2, 3)
+    assert torch.equal(duplicate(function)(network, x)[0], function(network, x)[0])
