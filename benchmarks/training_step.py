@@ -42,7 +42,7 @@ def main() -> None:
     args = parser.parse_args()
 
     policy, batch = make(args.dim, args.n_points, args.batch_size, args.dtype, args.device)
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-4)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     dtype = getattr(torch, args.dtype)
 
     def forward() -> torch.Tensor:

@@ -6,7 +6,7 @@ from torch import nn
 from torch.autograd import forward_ad
 from torch.nn.functional import linear
 
-from lerobot_uca.networks.dual import LayerNorm, Linear
+from lerobot_uca.networks.dual import LayerNorm, Linear, attention
 
 LAYERS = {
     "Linear": lambda: Linear(6, 4),
@@ -72,6 +72,57 @@ def test_gradients_of_value_and_tangent(layer):
         gradients.append(torch.autograd.grad(loss, [x, *layer.parameters()]))
     for got, expected in zip(*gradients, strict=True):
         torch.testing.assert_close(got, expected)
+
+
+def of_attention(function):
+    """`attention` as a function of one tensor, all of whose parts have a tangent."""
+    return lambda x: function(x[0, :, :2, :3], x[0, :, 2:, :3], x[1, :, 1:4, 2:6])
+
+
+def plain_attention(q, k, v):
+    return torch.softmax(q @ k.transpose(-2, -1) / q.shape[-1] ** 0.5, dim=-1) @ v
+
+
+@pytest.mark.parametrize("jvp", [dual_numbers, functional])
+def test_value_and_tangent_of_attention(jvp):
+    x, tangent = torch.randn(2, 2, 4, 5, 6, dtype=torch.float64)
+    expected = functional(of_attention(plain_attention), x, tangent)
+    for got, want in zip(jvp(of_attention(attention), x, tangent), expected, strict=True):
+        torch.testing.assert_close(got, want)
+
+
+def test_the_tangent_of_attention_is_a_directional_derivative():
+    x, tangent = torch.randn(2, 2, 4, 5, 6, dtype=torch.float64)
+    f, epsilon = of_attention(attention), 1e-6
+    expected = (f(x + epsilon * tangent) - f(x - epsilon * tangent)) / (2 * epsilon)
+    torch.testing.assert_close(dual_numbers(f, x, tangent)[1], expected, atol=1e-7, rtol=1e-6)
+
+
+def test_gradients_of_value_and_tangent_of_attention():
+    x, tangent = torch.randn(2, 2, 4, 5, 6, dtype=torch.float64)
+    x.requires_grad_()
+    gradients = []
+    for function in (attention, plain_attention):
+        y, y_tangent = functional(of_attention(function), x, tangent)
+        gradients += torch.autograd.grad(y.sin().sum() + y_tangent.cos().sum(), x)
+    torch.testing.assert_close(*gradients)
+
+
+def test_normalisations_in_float32_as_a_gpus_autocast_computes_them(monkeypatch):
+    softmax, layer_norm = torch.softmax, torch.native_layer_norm
+    monkeypatch.setattr(torch, "softmax", lambda x, dim: softmax(x.float(), dim=dim))
+    monkeypatch.setattr(torch, "native_layer_norm", lambda x, *rest: layer_norm(x.float(), *rest))
+    x = torch.randn(2, 4, 5, 6)
+    layer = nn.Sequential(LayerNorm(6), Linear(6, 6))
+
+    def f(x):
+        y = layer(x)
+        return attention(y, y, y)
+
+    expected = functional(f, x, x)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        for got, want in zip(dual_numbers(f, x.bfloat16(), x.bfloat16()), expected, strict=True):
+            torch.testing.assert_close(got.float(), want, atol=0.05, rtol=0)
 
 
 def test_autocast_reaches_value_and_tangent():

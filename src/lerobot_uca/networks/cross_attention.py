@@ -3,15 +3,14 @@
 Letters as in `transformer`.
 """
 
-import torch
 from torch import Tensor, nn
 
-from lerobot_uca.networks.dual import LayerNorm, Linear
+from lerobot_uca.networks.dual import LayerNorm, Linear, attention
 from lerobot_uca.networks.transformer import ConditionActionTransformer, SelfAttention
 
 
 class CrossAttention(nn.Module):
-    """Multi-head attention of the action tokens to the condition tokens; see `SelfAttention` for its softmax."""
+    """Multi-head attention of the action tokens to the condition tokens."""
 
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
@@ -24,8 +23,7 @@ class CrossAttention(nn.Module):
         """Y (B, T, D) and P (B, S, D) to (B, T, D)."""
         q = self.q(Y).unflatten(-1, (self.n_heads, -1)).transpose(1, 2)  # (B, heads, T, d)
         k, v = self.kv(P).unflatten(-1, (2, self.n_heads, -1)).permute(2, 0, 3, 1, 4)  # (B, heads, S, d)
-        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
-        return self.out((weights @ v).transpose(1, 2).flatten(-2))
+        return self.out(attention(q, k, v).transpose(1, 2).flatten(-2))
 
 
 class CrossAttentionBlock(nn.Module):

@@ -10,15 +10,12 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from lerobot_uca.networks.dual import LayerNorm, Linear
+from lerobot_uca.networks.dual import LayerNorm, Linear, attention
 from lerobot_uca.networks.embeddings import TimeEmbedding
 
 
 class SelfAttention(nn.Module):
-    """Multi-head self-attention.
-
-    The softmax is written out because PyTorch's fused `scaled_dot_product_attention` has no forward-mode derivative.
-    """
+    """Multi-head self-attention."""
 
     def __init__(self, dim: int, n_heads: int) -> None:
         super().__init__()
@@ -28,11 +25,11 @@ class SelfAttention(nn.Module):
 
     def forward(self, tokens: Tensor, n_out: int | None = None) -> Tensor:
         """(B, S, D) to what the last n_out tokens (without it all) get from all, (B, n_out, D)."""
-        q, k, v = self.qkv(tokens).unflatten(-1, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)  # (B, heads, S, d)
+        qkv = self.qkv(tokens).unflatten(-1, (3, self.n_heads, -1))
+        q, k, v = qkv.permute(2, 0, 3, 1, 4).contiguous()  # (B, heads, S, d); one copy instead of one for each product
         if n_out is not None:
             q = q[:, :, -n_out:]
-        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), dim=-1)
-        return self.out((weights @ v).transpose(1, 2).flatten(-2))
+        return self.out(attention(q, k, v).transpose(1, 2).flatten(-2))
 
 
 class Block(nn.Module):

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference import INFERENCE
+from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
 
 @dataclass
@@ -155,9 +155,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     def reward_delta_indices(self) -> None:
         """Rewards are not used."""
 
-    def get_optimizer_preset(self) -> AdamWConfig:
+    def get_optimizer_preset(self) -> FusedAdamWConfig:
         """AdamW with the values above."""
-        return AdamWConfig(
+        return FusedAdamWConfig(
             lr=self.optimizer_lr,
             betas=self.optimizer_betas,
             eps=self.optimizer_eps,
