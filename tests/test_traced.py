@@ -48,6 +48,18 @@ def test_where_a_runtime_goes_wrong_pytorch_steps_in(runtime, monkeypatch, caplo
 
 
 @every_runtime
+def test_where_a_runtime_fails_pytorch_steps_in(runtime, monkeypatch, caplog):
+    def fail(*_):
+        raise RuntimeError("no such instruction")
+
+    monkeypatch.setattr(runtime, "open", fail)
+    network, x = make_network(), torch.randn(2, 3)
+    with torch.no_grad():
+        assert torch.equal(runtime(call)(network, x)[0], network(x))
+    assert caplog.messages == [f"{runtime.runtime} failed (no such instruction); PyTorch is used."]
+
+
+@every_runtime
 def test_results_are_not_overwritten_by_the_next_call(runtime):
     network, function = make_network(), runtime(call)
     (first,) = function(network, torch.zeros(1, 3))

@@ -11,6 +11,7 @@ import logging
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from textwrap import shorten
 from typing import ClassVar, override
 
 import numpy as np
@@ -36,7 +37,8 @@ class TracedFunction(ABC):
 
     The network is traced, which takes about a second, when it is first called with inputs of new shapes, and again
     when its first or last weight was changed in place. The trace holds for all values of the inputs: the function must
-    not branch on them. What the runtime makes of it is compared with PyTorch once; if it differs, PyTorch goes on.
+    not branch on them. What the runtime makes of it is compared with PyTorch once; where it differs or fails, PyTorch
+    goes on.
 
     Args:
         eager: function(network, *inputs) in PyTorch: what is traced, and the reference. Returns a tuple.
@@ -84,15 +86,22 @@ class TracedFunction(ABC):
         model = to_onnx(self.eager, network, shapes, [f"input_{index}" for index in range(len(shapes))])
         n_weights = sum(weight.numel() for weight in network.parameters())
         n_threads = max(1, min(torch.get_num_threads(), n_weights * shapes[0][0] // WEIGHTS_PER_THREAD))
-        run = self.open(model, shapes, n_threads)
+        try:
+            run = self.open(model, shapes, n_threads)
+            if self._equals_pytorch(run, network, shapes):
+                return run
+            problem = "computes something else than PyTorch on this machine"
+        except RuntimeError as error:  # OpenVINO's, where it lacks an instruction for example
+            problem = f"failed ({shorten(str(error), 200)})"
+        logger.warning("%s %s; PyTorch is used.", self.runtime, problem)
+        return lambda inputs: self.eager(network, *inputs)
+
+    def _equals_pytorch(self, run: Run, network: nn.Module, shapes: Sequence[torch.Size]) -> bool:
         generator = torch.Generator().manual_seed(0)
         inputs = [torch.rand(shape, generator=generator) for shape in shapes]
         with torch.no_grad(), torch.autocast("cpu", enabled=False):
-            pairs = list(zip(run(inputs), self.eager(network, *inputs), strict=True))
-        if all((got - expected).abs().max() <= self.tolerance * expected.abs().max() for got, expected in pairs):
-            return run
-        logger.warning("%s computes something else than PyTorch on this machine; PyTorch is used.", self.runtime)
-        return lambda inputs: self.eager(network, *inputs)
+            pairs = zip(run(inputs), self.eager(network, *inputs), strict=True)
+            return all((got - expected).abs().max() <= self.tolerance * expected.abs().max() for got, expected in pairs)
 
 
 class OnnxFunction(TracedFunction):
@@ -125,15 +134,16 @@ class OpenVinoFunction(TracedFunction):
 
     @override
     def open(self, model: bytes, input_shapes: Sequence[torch.Size], n_threads: int) -> Run:
+        core = openvino.Core()
+        has_bfloat16 = "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
         settings = {
-            "INFERENCE_PRECISION_HINT": self.precision,
+            "INFERENCE_PRECISION_HINT": self.precision if has_bfloat16 else "f32",
             "INFERENCE_NUM_THREADS": n_threads,
             "NUM_STREAMS": 1,
             # Its fused attention gives wrong numbers where fewer tokens ask than answer, as in the last block (2025.4
             # and 2026.4); the operations one by one take as long.
             "SNIPPETS_MODE": "DISABLE",
         }
-        core = openvino.Core()
         request = core.compile_model(core.read_model(model), "CPU", settings).create_infer_request()
         held = [np.empty(shape, np.float32) for shape in input_shapes]
         for index, array in enumerate(held):
