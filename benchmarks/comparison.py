@@ -19,13 +19,13 @@ RESULTS = Path(__file__).parent / "results" / "comparison.csv"
 FIRST_EVAL_SEED = 3_000_000
 STEPS = {"dial-turn": 600, "shelf-place": 1200, "door": 1200}
 ADROIT_TASKS = ("door",)
-UCA_FLOW = "configs/uca_flow_small.yaml"
+UCA_FLOW = ["configs/uca_flow_small.yaml", "--batch_size=128"]  # the paper's batch
 METHODS = {
-    "uca_flow": [UCA_FLOW],
-    "without_dual_pass": [UCA_FLOW, "--policy.dual_pass=false"],
-    "cross_attention": [UCA_FLOW, "--policy.conditioning=cross_attention"],
-    "adaln": [UCA_FLOW, "--policy.conditioning=adaln"],
-    "simple_dp3": ["configs/simple_dp3_small.yaml"],
+    "uca_flow": UCA_FLOW,
+    "without_dual_pass": [*UCA_FLOW, "--policy.dual_pass=false"],
+    "cross_attention": [*UCA_FLOW, "--policy.conditioning=cross_attention"],
+    "adaln": [*UCA_FLOW, "--policy.conditioning=adaln"],
+    "simple_dp3": ["configs/simple_dp3_small.yaml", "--batch_size=128"],
 }
 # Success rates [%]: UCA-Flow's and the ablations' from the paper's table of components, Simple DP3's from its table of
 # 37 tasks, which has Meta-World's only by difficulty.

@@ -3,8 +3,10 @@
 import copy
 import pickle
 
+import openvino
 import pytest
 import torch
+from onnxruntime.capi import onnxruntime_pybind11_state as onnxruntime_errors
 from torch import nn
 
 from lerobot_uca.networks.transformer import UnifiedTransformer
@@ -50,13 +52,43 @@ def test_where_a_runtime_goes_wrong_pytorch_steps_in(runtime, monkeypatch, caplo
 @every_runtime
 def test_where_a_runtime_fails_pytorch_steps_in(runtime, monkeypatch, caplog):
     def fail(*_):
-        raise RuntimeError("no such instruction")
+        raise onnxruntime_errors.NotImplemented("no such instruction")
 
     monkeypatch.setattr(runtime, "open", fail)
     network, x = make_network(), torch.randn(2, 3)
     with torch.no_grad():
         assert torch.equal(runtime(call)(network, x)[0], network(x))
     assert caplog.messages == [f"{runtime.runtime} failed (no such instruction); PyTorch is used."]
+
+
+@every_runtime
+def test_weights_that_diverged_are_no_runtimes_fault(runtime, caplog):
+    network = make_network()
+    with torch.no_grad():
+        network[0].weight.fill_(torch.nan)
+    (result,) = runtime(call)(network, torch.randn(2, 3))
+    assert result.isnan().all()
+    assert not caplog.messages
+
+
+@every_runtime
+def test_pytorch_steps_in_with_float32_under_autocast(runtime, monkeypatch):
+    monkeypatch.setattr(runtime, "tolerance", -1.0)
+    network, x = make_network(), torch.randn(2, 3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        (result,) = runtime(call)(network, x)
+    assert torch.equal(result, network(x))
+
+
+@pytest.mark.skipif(
+    "BF16" not in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"),
+    reason="the processor has no bfloat16 instructions",
+)
+def test_bfloat16_is_what_it_says():
+    network, x = make_network(), torch.randn(2, 3)
+    with torch.no_grad():
+        error = (BFloat16Function(call)(network, x)[0] - network(x)).abs().max()
+    assert 1e-4 < error < 0.05
 
 
 @every_runtime

@@ -125,6 +125,14 @@ def test_normalisations_in_float32_as_a_gpus_autocast_computes_them(monkeypatch)
             torch.testing.assert_close(got.float(), want, atol=0.05, rtol=0)
 
 
+def test_bfloat16_with_float32_weights():
+    layer, x = LayerNorm(6), torch.randn(5, 6)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        for got, want in zip(dual_numbers(layer, x.bfloat16(), x.bfloat16()), functional(layer, x, x), strict=True):
+            assert got.dtype is torch.bfloat16
+            torch.testing.assert_close(got.float(), want, atol=0.05, rtol=0)
+
+
 def test_autocast_reaches_value_and_tangent():
     x = torch.randn(2, 6)
     with torch.autocast("cpu", dtype=torch.bfloat16):

@@ -13,6 +13,7 @@ def test_the_fused_step_is_lerobots():
     for config in (AdamWConfig(**settings), FusedAdamWConfig(**settings)):
         weight = torch.nn.Parameter(start.clone())
         optimizer = config.build([weight])
+        assert bool(optimizer.param_groups[0]["fused"]) == isinstance(config, FusedAdamWConfig)
         for step in range(5):
             optimizer.zero_grad()
             (weight.sin() * (step + 1)).sum().backward()

@@ -430,6 +430,13 @@ def test_finite_values_may_have_an_infinite_sum(policy):
     policy._check_finite({OBS_POINT_CLOUD: cloud}, [OBS_POINT_CLOUD])
 
 
+def test_observations_in_bfloat16(policy):
+    observation = {key: value.bfloat16() for key, value in make_observation().items()}
+    policy._check_finite(observation, observation)
+    with pytest.raises(UserError, match=r"'observation.state' must be finite, got 9 of 9"):
+        policy._check_finite({"observation.state": observation["observation.state"] * torch.nan}, ["observation.state"])
+
+
 def test_another_number_of_samples_needs_a_reset(policy):
     policy.select_action(make_observation(1))
     with pytest.raises(UserError, match=r"must have 1 samples, as since the last reset\(\), got 3"):

@@ -38,9 +38,9 @@ class LayerNorm(nn.LayerNorm):
         shape = list(self.normalized_shape)
         y, mean, inverse_std = torch.native_layer_norm(x, shape, self.weight, self.bias, self.eps)
         change, _, _ = torch.ops.aten.native_layer_norm_backward(
-            tangent.to(y.dtype), x.to(y.dtype), shape, mean, inverse_std, None, None, [True, False, False]
+            tangent.to(mean.dtype), x.to(mean.dtype), shape, mean, inverse_std, None, None, [True, False, False]
         )
-        return forward_ad.make_dual(y, change if self.weight is None else change * self.weight.to(change.dtype))
+        return forward_ad.make_dual(y, (change if self.weight is None else change * self.weight).to(y.dtype))
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:

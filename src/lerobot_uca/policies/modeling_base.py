@@ -309,6 +309,7 @@ def _is_finite(values: Tensor) -> bool:
 
     On a CPU NumPy sums: of 64 clouds PyTorch's sum wakes a second thread, which then spins on a core the network needs.
     """
+    for_numpy = values.device.type == "cpu" and values.dtype is not torch.bfloat16
     with np.errstate(over="ignore", invalid="ignore"):
-        total = values.detach().numpy().sum() if values.device.type == "cpu" else values.sum()
+        total = values.detach().numpy().sum() if for_numpy else values.sum()
     return math.isfinite(total) or bool(torch.isfinite(values).all())
