@@ -5,7 +5,7 @@ python benchmarks/latency.py --draw_only     # the picture again, from the CSV f
 
 One process, batch 1, Meta-World's shapes (state 9, action 4), without pre- and postprocessing: the newest frame goes
 through the encoder, the one before it is remembered, the network makes the actions. UCA-Flow runs as it does by
-default, in ONNX Runtime (always in one thread), and in PyTorch, as the baselines do. The policies take turns, so that
+default, in OpenVINO, and in PyTorch, as the baselines do. The policies take turns, so that
 whatever else the machine does meets all of them alike. Each finds its weights driven out of the cache by those before
 it: alone, UCA-Flow is twice as fast (benchmarks/inference.py).
 """
@@ -60,12 +60,12 @@ def main() -> None:
 
 def measure(n_rounds: int, n_warm_up: int) -> list[dict[str, str]]:
     """A row for each policy, number of points and number of threads."""
-    policies = {name: make(**settings) for name, settings in POLICIES.items()}
     rows = []
     print(f"{'':20}{'parameters':>13}{'calls':>7}{'points':>8}{'threads':>9}{'median':>9}{'p10':>9}{'p90':>9}", end="")
     print(f"{'x UCA-Flow':>12}{'x public code':>15}")
     for n_threads in THREADS:
         torch.set_num_threads(n_threads)
+        policies = {name: make(**settings) for name, settings in POLICIES.items()}  # a trace keeps its threads
         for n_points in POINTS:
             observation = {
                 OBS_POINT_CLOUD: torch.rand(1, n_points, 3) * 2 - 1,
