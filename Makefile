@@ -1,4 +1,4 @@
-# make quickstart   demonstrations, training and evaluation of a real Meta-World task, about 10 minutes on two cores
+# make quickstart   demonstrations, training and evaluation of a real Meta-World task, about 4 minutes on two cores
 # make test         the tests
 # make check        style, types, formatting
 

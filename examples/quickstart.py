@@ -40,14 +40,14 @@ STEPS = (
     Step(
         f"lerobot-train --config_path=configs/uca_flow_small.yaml --dataset.repo_id=local/{TASK} "
         f"--dataset.root={DATASET} --output_dir={TRAINING}",
-        "about 4 minutes",
+        "about a minute",
         TRAINING,
         CHECKPOINT / "model.safetensors",
     ),
     Step(
         f"lerobot-eval --policy.path={CHECKPOINT} {ENVIRONMENT} --eval.n_episodes={N_EPISODES} --eval.batch_size=2 "
         f"--output_dir={EVALUATION}",
-        "about 2 minutes",
+        "about 90 seconds",
         EVALUATION,
         EVALUATION / "eval_info.json",
     ),
