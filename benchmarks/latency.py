@@ -5,8 +5,8 @@ python benchmarks/latency.py --draw_only     # the picture again, from the CSV f
 
 One process, batch 1, Meta-World's shapes (state 9, action 4), without pre- and postprocessing: the newest frame goes
 through the encoder, the one before it is remembered, the network makes the actions. UCA-Flow runs as it does by
-default, in OpenVINO, and in PyTorch, as the baselines do. The policies take turns, so that
-whatever else the machine does meets all of them alike. Each finds its weights driven out of the cache by those before
+default, in OpenVINO, and in PyTorch, as the baselines do. The policies take turns, so that whatever else the machine
+does meets all of them alike. Each finds its weights driven out of the cache by those before
 it: alone, UCA-Flow is twice as fast (benchmarks/inference.py).
 """
 

@@ -355,7 +355,7 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
         (
             {"inference": "tensorrt"},
-            "policy.inference must be one of eager, openvino, openvino_bfloat16, onnxruntime, compile",
+            "must be one of eager, openvino, openvino_bfloat16, onnxruntime, compile, got 'tensorrt'",
         ),
         ({"n_layers": 0}, "policy.n_layers must be at least 1, got 0"),
         (

@@ -48,8 +48,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
 
     # What computes actions, the same to rounding: eager (PyTorch, the reference), openvino or onnxruntime (on a CPU;
     # faster for small networks; on other devices it is PyTorch), compile (torch.compile, on a GPU with CUDA graphs).
-    # openvino_bfloat16 is faster still where the processor has bfloat16 instructions, UCA-Flow's actions within a
-    # hundredth of their range (README).
+    # openvino_bfloat16 is faster still where the processor has bfloat16 instructions, UCA-Flow's actions within
+    # about 2 % of their range (README).
     inference: str = "eager"
     # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). LeRobot also evaluates with it
     # during training; lerobot-eval uses float32 unless told policy.use_amp=true.
