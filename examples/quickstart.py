@@ -40,7 +40,7 @@ STEPS = (
     Step(
         f"lerobot-train --config_path=configs/uca_flow_small.yaml --dataset.repo_id=local/{TASK} "
         f"--dataset.root={DATASET} --output_dir={TRAINING}",
-        "about 80 seconds",
+        "about 70 seconds",
         TRAINING,
         CHECKPOINT / "model.safetensors",
     ),
