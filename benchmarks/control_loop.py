@@ -22,8 +22,8 @@ from lerobot.policies import make_pre_post_processors
 
 import lerobot_policy_uca_flow  # noqa: F401  (registers policy and environment)
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv, ScriptedExpert
-from lerobot_uca.envs.point_cloud import sample_farthest
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.geometry import sample_farthest
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 

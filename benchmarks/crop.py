@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_uca.envs.metaworld import CLOUD_CAMERA, MetaworldPointCloudEnv, ScriptedExpert, task_descriptions
-from lerobot_uca.envs.point_cloud import Crop
-from lerobot_uca.envs.ray_casting import _RayCaster
+from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.point_clouds.ray_casting import RayCaster
 
 TABLE_SLACK = 0.03  # [m]
 
@@ -43,7 +43,7 @@ def worst_shares(task: str, n_seeds: int) -> tuple[float, float]:
     env = MetaworldPointCloudEnv(task)
     low = np.array(env.crop.low) - [0, 0, TABLE_SLACK]
     around_origins = Crop(tuple(low), env.crop.high)
-    caster = _RayCaster(np.asarray(CLOUD_CAMERA.position), CLOUD_CAMERA.ray_directions(), with_normals=False)
+    caster = RayCaster(CLOUD_CAMERA.position, CLOUD_CAMERA.ray_directions(), with_normals=False)
     positions, points = [], []
     for seed in range(n_seeds):
         env.reset(seed=seed)

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
 import lerobot_policy_uca_flow  # noqa: F401  (registers the policies)
+from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.features import OBS_POINT_CLOUD
 
 
@@ -31,13 +31,13 @@ def main() -> None:
     config = PreTrainedConfig.from_pretrained(args.checkpoint)
     config.device = "cpu"
     policy = get_policy_class(config.type).from_pretrained(args.checkpoint, config=config).eval()
-    dataset = LeRobotDataset(f"local/{args.dataset.name}", root=args.dataset)
+    dataset = BatchedDataset(f"local/{args.dataset.name}", root=args.dataset)
     windows = {
         **dict.fromkeys((OBS_POINT_CLOUD, "observation.state"), config.observation_delta_indices),
         "action": config.action_delta_indices,
     }
     seconds = {key: [step / dataset.fps for step in steps] for key, steps in windows.items()}
-    dataset = LeRobotDataset(f"local/{args.dataset.name}", root=args.dataset, delta_timestamps=seconds)
+    dataset = BatchedDataset(f"local/{args.dataset.name}", root=args.dataset, delta_timestamps=seconds)
     preprocess, _ = make_pre_post_processors(config, pretrained_path=str(args.checkpoint))
     raw = default_collate(dataset.__getitems__(list(range(len(dataset)))))
     batch = preprocess(raw)

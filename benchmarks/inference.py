@@ -27,7 +27,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import lerobot_policy_uca_flow  # noqa: F401  (registers the policy)
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.inference import INFERENCE
+from lerobot_uca.inference.backends import BACKENDS, make_backend
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
@@ -48,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch_sizes", type=int, nargs="+", default=[1, 2, 64])
     parser.add_argument("--calls", type=int, default=300, help="timed calls of each")
-    parser.add_argument("--computed_by", nargs="+", default=RUNTIMES, choices=list(INFERENCE))
+    parser.add_argument("--computed_by", nargs="+", default=RUNTIMES, choices=BACKENDS)
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
     peak, bandwidth = matrix_product_peak(args.device), reading_bandwidth(args.device)
@@ -94,7 +94,7 @@ def measure(policy: UCAFlowPolicy, batch_size: int, n_calls: int, peak: float, b
     def generate_one(generator: nn.Module, noise: Tensor, o: Tensor) -> tuple[Tensor]:
         return (policy.generate(generator, noise, o),)
 
-    generate = INFERENCE[config.inference](generate_one)
+    generate = make_backend(config.inference)(generate_one)
     milliseconds = (
         times(lambda: policy._encode_frame(encoder, *frame), n_calls, device),
         times(lambda: generate(generator, noise, o), n_calls, device),

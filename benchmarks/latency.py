@@ -32,7 +32,7 @@ POLICIES = {
     "UCA-Flow": {"policy_type": "uca_flow"},
     "UCA-Flow (PyTorch)": {"policy_type": "uca_flow", "inference": "eager"},
     "MP1": {"policy_type": "mp1"},
-    "FlowPolicy": {"policy_type": "flow"},
+    "FlowPolicy": {"policy_type": "flowpolicy"},
     "Simple DP3": {"policy_type": "simple_dp3"},
     "DP3": {"policy_type": "dp3"},
 }

@@ -13,8 +13,8 @@ from lerobot.envs import make_env_config
 
 import lerobot_policy_uca_flow  # noqa: F401  (registers the environments)
 from lerobot_uca.envs.configs import PointCloudEnvConfig
-from lerobot_uca.envs.expert import Expert
-from lerobot_uca.envs.point_cloud import sample_farthest
+from lerobot_uca.envs.experts.expert import Expert
+from lerobot_uca.point_clouds.geometry import sample_farthest
 
 TASKS = {
     "metaworld_pointcloud": ("drawer-close", "dial-turn", "shelf-place", "hand-insert", "hammer"),

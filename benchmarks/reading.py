@@ -21,7 +21,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.utils import SuppressProgressBars
 from torch.utils.data import DataLoader, Dataset
 
-import lerobot_policy_uca_flow  # noqa: F401  (registers batched reading)
+from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.features import OBS_POINT_CLOUD
 
 FPS, BATCH_SIZE = 80, 128
@@ -31,19 +31,6 @@ WINDOWS = {
     "observation.state": [-1 / FPS, 0],
     "action": [-1 / FPS, 0, 1 / FPS, 2 / FPS],
 }
-
-
-class Stock(Dataset[Any]):
-    """The dataset without `__getitems__`."""
-
-    def __init__(self, dataset: LeRobotDataset) -> None:
-        self.dataset = dataset
-
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        return self.dataset[index]
 
 
 def main() -> None:
@@ -58,8 +45,8 @@ def main() -> None:
         indices = np.random.default_rng(0).permutation(n_episodes * length).tolist()
         print(f"{n_episodes} episodes x {length} frames x {n_points} points, batches of {BATCH_SIZE}")
         for n_workers in (0, 2):
-            stock = measure(Stock(open_dataset(root)), indices, n_workers, n_batches=2)
-            ours = measure(open_dataset(root), indices, n_workers, n_batches=len(indices) // BATCH_SIZE)
+            stock = measure(open_dataset(LeRobotDataset, root), indices, n_workers, n_batches=2)
+            ours = measure(open_dataset(BatchedDataset, root), indices, n_workers, n_batches=len(indices) // BATCH_SIZE)
             print(
                 f"{n_workers} workers: stock {stock[1]:7.3f} ms a sample, first batch {stock[0]:5.1f} s; "
                 f"batched {ours[1]:6.3f} ms a sample, first batch {ours[0]:5.1f} s; ratio {stock[1] / ours[1]:.0f}"
@@ -95,9 +82,9 @@ def seconds_each(batches: Iterable[Any]) -> Iterator[float]:
         start = now
 
 
-def open_dataset(root: Path) -> LeRobotDataset:
+def open_dataset(kind: type[LeRobotDataset], root: Path) -> LeRobotDataset:
     """The dataset as training opens it."""
-    return LeRobotDataset("benchmark/random", root=root, delta_timestamps=WINDOWS)
+    return kind("benchmark/random", root=root, delta_timestamps=WINDOWS)
 
 
 def write(root: Path, n_episodes: int, length: int, n_points: int) -> None:

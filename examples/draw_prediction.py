@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 import lerobot_policy_uca_flow  # noqa: F401  (registers policy and environment)
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
-from lerobot_uca.envs.point_cloud import Crop
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 METRES_PER_ACTION = 0.01  # Meta-World moves the hand by up to 1 cm an action

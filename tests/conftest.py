@@ -54,7 +54,7 @@ SMALL_POLICIES: dict[str, dict] = {
         "n_timestep_tokens": 2,
         "n_interval_tokens": 2,
     },
-    **dict.fromkeys(("dp3", "simple_dp3", "flow", "mp1"), TINY_UNET),
+    **dict.fromkeys(("dp3", "simple_dp3", "flowpolicy", "mp1"), TINY_UNET),
 }
 """Sizes small enough for a test, by policy type."""
 

@@ -16,9 +16,9 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 
+from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.onnx_runner import OnnxPolicy
 from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, TINY_UNET, write_dataset
 
 BIN = Path(sys.executable).parent
@@ -69,9 +69,9 @@ def trained(tmp_path_factory) -> Path:
         "lerobot-uca-collect", *ENVIRONMENT, "--repo_id=test/data", f"--root={folder}/data", "--n_episodes=1"
     )
     assert "1 episodes, 200 frames, seeds from 1000000" in output
-    assert "torchcodec" not in output
+    assert "Traceback" not in output
     log = succeed(*train(folder / "data", folder / "train"))
-    assert "torchcodec" not in log
+    assert "Traceback" not in log
     assert re.search(r"loss_u:\d", log)
     assert re.search(r"loss_v:\d", log)
     return folder
@@ -108,7 +108,7 @@ def test_evaluation_reports_success_and_videos(checkpoint, tmp_path):
     log = succeed(
         "lerobot-eval", f"--policy.path={checkpoint}", *ENVIRONMENT, "--eval.n_episodes=1", f"--output_dir={tmp_path}"
     )
-    assert "torchcodec" not in log
+    assert "Traceback" not in log
     overall = json.loads((tmp_path / "eval_info.json").read_text())["overall"]
     assert overall["n_episodes"] == 1
     assert overall["pc_success"] in (0.0, 100.0)
@@ -218,7 +218,8 @@ def test_training_into_a_folder_that_cannot_be_written(dataset_root, tmp_path):
 def test_evaluation_into_a_folder_that_cannot_be_written(checkpoint, tmp_path):
     (tmp_path / "file").write_text("")
     command = ["lerobot-eval", f"--policy.path={checkpoint}", *ENVIRONMENT, "--eval.n_episodes=1"]
-    assert "Not a directory" in fail(*command, f"--output_dir={tmp_path}/file/evaluation")
+    line = fail(*command, f"--output_dir={tmp_path}/file/evaluation")
+    assert line.endswith(f"cannot be written: '{tmp_path}/file' is not a writable folder.")
 
 
 def test_collecting_into_a_folder_that_cannot_be_written(tmp_path):
@@ -240,7 +241,7 @@ def test_collected_data_opens_as_any_lerobot_dataset(trained):
     assert dataset[0][OBS_POINT_CLOUD].shape == (N_POINTS, 3)
 
 
-@pytest.mark.parametrize("name", ["dp3", "simple_dp3", "flow", "mp1"])
+@pytest.mark.parametrize("name", ["dp3", "simple_dp3", "flowpolicy", "mp1"])
 def test_baselines_are_trained_and_evaluated_by_the_same_commands(name, dataset_root, tmp_path, monkeypatch):
     """In this process, which has imported everything, and in episodes of 5 steps."""
     monkeypatch.setattr(MetaworldPointCloudEnv, "_max_episode_steps", 5)

@@ -14,15 +14,17 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 
 # What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
 ALLOWED = {
-    "policies": {"meanflow", "objectives", "networks", "inference", "errors", "features"},
-    "inference": {"traced", "errors"},
+    "inference": {"errors"},
     "objectives": {"meanflow", "networks"},
-    "envs": {"errors", "features"},
-    "data": {"envs", "errors", "features"},
-    "terminal": {"errors"},
-    "training": {"data", "policies", "errors"},
-    "export": {"policies", "traced", "errors", "features"},
-    "commands": {"data", "export"},
+    "policies": {"meanflow", "objectives", "networks", "inference", "point_clouds", "errors", "features", "registry"},
+    "envs": {"point_clouds", "errors", "features", "registry"},
+    "data": {"envs", "point_clouds", "errors", "features"},
+    "robots": {"point_clouds", "errors", "features", "registry"},
+    "visual": {"policies", "data", "envs", "point_clouds", "errors", "features"},
+    "deploy": {"policies", "inference", "errors", "features"},
+    "protocol": {"policies", "data", "envs", "errors", "features"},
+    "lerobot_patches": {"data", "policies", "errors", "features"},
+    "commands": {"data", "deploy", "protocol", "robots", "visual", "errors"},
 }
 
 
@@ -78,24 +80,86 @@ from lerobot.utils.import_utils import register_third_party_plugins
 register_third_party_plugins()
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-assert {"uca_flow", "dp3", "simple_dp3", "flow", "mp1"} <= set(PreTrainedConfig.get_known_choices())
+from lerobot.datasets import factory
+assert {"uca_flow", "dp3", "simple_dp3", "flowpolicy", "mp1"} <= set(PreTrainedConfig.get_known_choices())
 assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
-assert hasattr(LeRobotDataset, "__getitems__")
+assert hasattr(factory.LeRobotDataset, "__getitems__")
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
 
 
-def test_a_broken_part_never_takes_another_one_down():
+def load(before: str, after: str) -> subprocess.CompletedProcess[str]:
+    code = f"{before}\nimport lerobot_policy_uca_flow\n{after}"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+BREAKS = {
+    "a missing wheel": 'import sys; sys.modules["fpsample"] = None',
+    "any exception": """
+import builtins
+original = builtins.__import__
+def fail(name, *args, **kwargs):
+    if name == "fpsample":
+        raise RuntimeError("built for another NumPy")
+    return original(name, *args, **kwargs)
+builtins.__import__ = fail
+""",
+}
+
+
+@pytest.mark.parametrize("before", BREAKS.values(), ids=BREAKS)
+def test_a_broken_part_never_takes_another_one_down(before):
     """Without Meta-World's or fpsample's wheel the policy must still be there."""
-    code = """
-import sys
-sys.modules["fpsample"] = None
-import lerobot_policy_uca_flow
+    after = """
 from lerobot.policies.factory import get_policy_class
 assert get_policy_class("uca_flow").__name__ == "UCAFlowPolicy"
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    result = load(before, after)
     assert result.returncode == 0, result.stderr
     assert "lerobot_uca.envs.configs is not available" in result.stderr
+
+
+@pytest.mark.parametrize("engine", ["openvino", "onnxruntime"])
+def test_without_an_engine_every_policy_registers_and_pytorch_computes(engine):
+    after = f"""
+import torch
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+assert {{"uca_flow", "dp3", "simple_dp3", "flowpolicy", "mp1"}} <= set(PreTrainedConfig.get_known_choices())
+state = lambda *shape: PolicyFeature(FeatureType.STATE, shape)
+inputs = {{"observation.point_cloud": state(8, 3), "observation.state": state(2)}}
+outputs = {{"action": PolicyFeature(FeatureType.ACTION, (2,))}}
+for _ in range(2):
+    config = UCAFlowConfig(
+        device="cpu", input_features=inputs, output_features=outputs, dim=16, n_heads=2, inference="{engine}"
+    )
+    policy = UCAFlowPolicy(config).eval()
+    observation = {{"observation.point_cloud": torch.rand(1, 8, 3), "observation.state": torch.rand(1, 2)}}
+    action = policy.select_action(observation)
+    assert action.isfinite().all()
+"""
+    result = load(f'import sys; sys.modules["{engine}"] = None', after)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.count(f"policy.inference={engine} needs the package {engine}") == 1
+
+
+def test_a_type_that_another_plugin_has_registered_stays_theirs():
+    before = """
+from dataclasses import dataclass
+from lerobot.configs import PreTrainedConfig
+@PreTrainedConfig.register_subclass("dp3")
+@dataclass
+class ForeignConfig(PreTrainedConfig):
+    pass
+"""
+    after = """
+assert PreTrainedConfig.get_choice_class("dp3") is ForeignConfig
+assert {"uca_flow", "simple_dp3", "flowpolicy", "mp1"} <= set(PreTrainedConfig.get_known_choices())
+from lerobot.envs.configs import EnvConfig
+assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
+"""
+    result = load(before, after)
+    assert result.returncode == 0, result.stderr
+    assert "Type 'dp3' is registered by __main__ already; this package's DP3Config is left out." in result.stderr

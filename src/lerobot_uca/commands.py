@@ -24,7 +24,7 @@ def export() -> None:
     """`lerobot-uca-export`."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_uca.export import run
+    from lerobot_uca.deploy.export import run
 
     register_third_party_plugins()
     run()

@@ -8,9 +8,9 @@ from lerobot.envs import make_env_config
 
 from lerobot_uca.envs import adroit
 from lerobot_uca.envs.adroit import ARM, HAND, TASKS, AdroitPointCloudEnv, Outcome, make_simulator
-from lerobot_uca.envs.dapg import DAPGExpert, DAPGWeights
-from lerobot_uca.envs.point_cloud import Crop
+from lerobot_uca.envs.experts.dapg import DAPGExpert, DAPGWeights
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.geometry import Crop
 
 # What gymnasium-robotics calls the state it starts from, besides qpos and qvel.
 OWN_STATE = {"hammer": "board_pos", "door": "door_body_pos", "pen": "desired_orien"}

@@ -13,8 +13,8 @@ from lerobot_uca.envs.metaworld import (
     task_descriptions,
     task_groups,
 )
-from lerobot_uca.envs.point_cloud import Crop
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.geometry import Crop
 
 
 @pytest.fixture(scope="module")

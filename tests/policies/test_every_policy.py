@@ -10,7 +10,7 @@ from tests.conftest import N_ACTIONS, SMALL_POLICIES, make_batch, make_observati
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
-NETWORK_CALLS = {"uca_flow": 1, "dp3": 10, "simple_dp3": 10, "flow": 1, "mp1": 1}
+NETWORK_CALLS = {"uca_flow": 1, "dp3": 10, "simple_dp3": 10, "flowpolicy": 1, "mp1": 1}
 
 VARIANTS = {
     **{name: (name, {}) for name in NETWORK_CALLS},
@@ -34,7 +34,22 @@ def test_every_registered_policy_is_here():
         for name in PreTrainedConfig.get_known_choices()
         if PreTrainedConfig.get_choice_class(name).__module__.startswith("lerobot_uca.")
     }
-    assert ours == set(NETWORK_CALLS)
+    assert ours == {*NETWORK_CALLS, "flow"}
+
+
+def test_a_checkpoint_of_flowpolicys_former_type_loads(tmp_path):
+    policy = make("flowpolicy").eval()
+    policy.save_pretrained(tmp_path)
+    config = tmp_path / "config.json"
+    config.write_text(config.read_text().replace('"type": "flowpolicy"', '"type": "flow"'))
+    loaded = PreTrainedConfig.from_pretrained(tmp_path)
+    assert loaded.type == "flowpolicy"
+    noise, observation = torch.randn(2, 4, N_ACTIONS), make_observation(2)
+    actions = [
+        each.select_action(observation, noise=noise)
+        for each in (policy, get_policy_class(loaded.type).from_pretrained(tmp_path).eval())
+    ]
+    assert torch.equal(*actions)
 
 
 @pytest.mark.parametrize("name", NETWORK_CALLS)
@@ -114,7 +129,7 @@ def test_training_in_bfloat16(variant):
     assert actions.dtype == torch.float32
 
 
-@pytest.mark.parametrize(("name", "n_steps"), [("dp3", 50), ("flow", 150), ("mp1", 150)])
+@pytest.mark.parametrize(("name", "n_steps"), [("dp3", 50), ("flowpolicy", 150), ("mp1", 150)])
 def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
     assert overfit(make(name, unet_widths=(32, 64), ema_power=0.6), n_steps) < 0.4
 
@@ -128,11 +143,11 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
         ("simple_dp3", {"unet_blocks": 0}, "policy.unet_blocks must be at least 1, got 0"),
         ("simple_dp3", {"unet_groups": 0}, "policy.unet_groups must be at least 1, got 0"),
         ("simple_dp3", {"unet_kernel_size": 4}, "policy.unet_kernel_size must be odd, got 4"),
-        ("flow", {"time_dim": 7}, "policy.time_dim must be even and at least 4, got 7"),
+        ("flowpolicy", {"time_dim": 7}, "policy.time_dim must be even and at least 4, got 7"),
         ("simple_dp3", {"n_inference_steps": 101}, "must be from 1 to n_training_steps = 100, got 101"),
         ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be one of eager, openvino, "),
-        ("flow", {"delta": 0.0}, "policy.delta must be between 0 and 1, got 0.0"),
-        ("flow", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),
+        ("flowpolicy", {"delta": 0.0}, "policy.delta must be between 0 and 1, got 0.0"),
+        ("flowpolicy", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),
         ("mp1", {"horizon": 3}, "policy.horizon must be at least n_obs_steps"),
     ],
 )

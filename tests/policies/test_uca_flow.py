@@ -17,7 +17,7 @@ from torch import nn
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.meanflow import sample_intervals
-from lerobot_uca.networks import dual
+from lerobot_uca.networks import forward_mode
 from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
@@ -214,8 +214,8 @@ def test_training_equals_the_plain_method(policy, monkeypatch):
     loss, _ = policy.forward(batch)
     loss.backward()
 
-    monkeypatch.setattr(dual.Linear, "forward", nn.Linear.forward)
-    monkeypatch.setattr(dual.LayerNorm, "forward", nn.LayerNorm.forward)
+    monkeypatch.setattr(forward_mode.Linear, "forward", nn.Linear.forward)
+    monkeypatch.setattr(forward_mode.LayerNorm, "forward", nn.LayerNorm.forward)
     config, encoder, network, x = policy.config, policy.model.encoder, policy.model.generator, batch["action"]
     pooled = torch.relu(encoder.points.per_point(batch[OBS_POINT_CLOUD])).amax(dim=-2)
     o = torch.cat([encoder.points.project(pooled), encoder.state(batch["observation.state"])], dim=-1)

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from lerobot_uca.data.demonstrations import demonstrations
 from lerobot_uca.envs.configs import PointCloudEnvConfig
-from lerobot_uca.envs.expert import Attempt
+from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 

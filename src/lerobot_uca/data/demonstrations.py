@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.expert import Attempt
+from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 
 

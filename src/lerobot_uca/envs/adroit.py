@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.point_cloud import Array, Camera, Crop
 from lerobot_uca.envs.point_cloud_env import Observation, PointCloudEnv
-from lerobot_uca.envs.ray_casting import Marker
 from lerobot_uca.envs.task_names import only_task, resolve_tasks
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.cameras import Marker
+from lerobot_uca.point_clouds.geometry import Array, Camera, Crop
 
 ACTION_REPEAT = 2
 FPS = 50  # 2 environment steps of 10 ms
@@ -29,7 +29,7 @@ DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _C = np.sqrt(0.5)
 TILTED = ((1.0, 0.0, 0.0), (0.0, _C, -_C), (0.0, _C, _C))  # 45 deg about x: forward and down
 
-PICTURE_CAMERA = Camera("vil_camera", (0.0, -1.2, 1.2), TILTED, fovy=45.0, width=160, height=160)
+PICTURE_CAMERA = Camera.from_fovy("vil_camera", (0.0, -1.2, 1.2), TILTED, fovy=45.0, size=(160, 160))
 
 
 class Outcome(NamedTuple):
@@ -73,7 +73,7 @@ class Task(NamedTuple):
 
 def top(height: float, pixels: int) -> Camera:
     """The baselines' camera above the table at a height [m], looking down."""
-    return Camera("top", (0.0, 0.0, height), DOWN, fovy=45.0, width=pixels, height=pixels)
+    return Camera.from_fovy("top", (0.0, 0.0, height), DOWN, fovy=45.0, size=(pixels, pixels))
 
 
 # The baselines cast 84 x 84 rays and fill up with zeros where too few points are left of a hammer or a pen. More rays
@@ -99,7 +99,7 @@ TASKS = {
         "turn the pen in the hand until it points where the other pen points",
         "AdroitHandPenEnv",
         (),
-        Camera("tilted", (0.0, -0.8, 0.8), TILTED, fovy=45.0, width=192, height=192),
+        Camera.from_fovy("tilted", (0.0, -0.8, 0.8), TILTED, fovy=45.0, size=(192, 192)),
         Crop((-0.17, -0.34, 0.05), (0.28, -0.04, 0.4)),
         # cosine of the angle between the axes of both pens
         papers_goal=lambda outcome: bool(outcome.observation[33:36] @ outcome.observation[36:39] > 0.95),

@@ -13,11 +13,13 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_uca.envs import adroit, adroit_experts, metaworld
-from lerobot_uca.envs.expert import Attempt, attempts_by_seed
+from lerobot_uca.envs import adroit, metaworld
+from lerobot_uca.envs.experts import adroit_experts
+from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.registry import register
 
 
 @dataclass
@@ -99,7 +101,7 @@ def _vectorize(make: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -
     return gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs)
 
 
-@EnvConfig.register_subclass("metaworld_pointcloud")
+@register(EnvConfig, "metaworld_pointcloud")
 @dataclass
 class MetaworldPointCloudConfig(PointCloudEnvConfig):
     """Meta-World's v3 tasks, by name with or without '-v3', or easy, medium, hard, very_hard, paper, all."""
@@ -136,7 +138,7 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
         return [f"{part}_{axis}" for part in ("hand", "right_finger", "left_finger") for axis in "xyz"]
 
 
-@EnvConfig.register_subclass("adroit_pointcloud")
+@register(EnvConfig, "adroit_pointcloud")
 @dataclass
 class AdroitPointCloudConfig(PointCloudEnvConfig):
     """Adroit's dexterous tasks: hammer, door, pen, relocate, or paper (the first three), all."""

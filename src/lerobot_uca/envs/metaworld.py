@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.point_cloud import Array, Camera, Crop
 from lerobot_uca.envs.point_cloud_env import Observation, PointCloudEnv
-from lerobot_uca.envs.ray_casting import Marker
 from lerobot_uca.envs.task_names import only_task, resolve_tasks
+from lerobot_uca.point_clouds.cameras import Marker
+from lerobot_uca.point_clouds.geometry import Array, Camera, Crop
 
 # Meta-World's camera 'corner2' (euler 3.9 2.3 0.6), moved to where DP3, FlowPolicy and MP1 put it. Its axes are
 # written out because the camera must exist before the simulator does; a test compares them with the model's.
@@ -26,7 +26,7 @@ CORNER2_ROTATION = (
 
 def corner2(width: int, height: int) -> Camera:
     """The baselines' camera at a resolution [pixels]."""
-    return Camera("corner2", (0.6, 0.295, 0.8), CORNER2_ROTATION, fovy=60.0, width=width, height=height)
+    return Camera.from_fovy("corner2", (0.6, 0.295, 0.8), CORNER2_ROTATION, fovy=60.0, size=(width, height))
 
 
 CLOUD_CAMERA = corner2(128, 128)

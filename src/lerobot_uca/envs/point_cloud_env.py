@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.point_cloud import Array, Camera, Crop, sample_farthest
-from lerobot_uca.envs.ray_casting import Marker, PictureCamera, PointCloudCamera
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.cameras import Marker, PictureCamera, PointCloudCamera
+from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, sample_farthest
 
 PICTURE_ZOOM = 2  # each ray becomes 2 x 2 pixels: 320 x 320 is large enough to look at, and four times cheaper
 
@@ -94,8 +94,9 @@ class PointCloudEnv(gym.Env[Any, Any]):
         simulator, camera = self._simulator, self._cloud_camera.camera
         points = self._cloud_camera.capture(simulator.model, simulator.data, self._markers())
         if len(points) == 0:
+            position = tuple(camera.position.tolist())
             raise UserError(
-                f"{self.benchmark} {self.task}: the cloud is empty. Camera {camera.name} at {camera.position} "
+                f"{self.benchmark} {self.task}: the cloud is empty. Camera {camera.name} at {position} m "
                 f"sees no point inside the crop {self.crop.low} to {self.crop.high} m."
             )
         return {

@@ -6,7 +6,7 @@ Letters as in `transformer`.
 import torch
 from torch import Tensor, nn
 
-from lerobot_uca.networks.dual import LayerNorm, Linear
+from lerobot_uca.networks.forward_mode import LayerNorm, Linear
 from lerobot_uca.networks.transformer import ConditionActionTransformer, SelfAttention
 
 

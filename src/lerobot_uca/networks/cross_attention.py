@@ -5,7 +5,7 @@ Letters as in `transformer`.
 
 from torch import Tensor, nn
 
-from lerobot_uca.networks.dual import LayerNorm, Linear, attention
+from lerobot_uca.networks.forward_mode import LayerNorm, Linear, attention
 from lerobot_uca.networks.transformer import ConditionActionTransformer, SelfAttention
 
 

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from lerobot_uca.networks.dual import Linear
+from lerobot_uca.networks.forward_mode import Linear
 
 
 class TimeEmbedding(nn.Module):

@@ -10,8 +10,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from lerobot_uca.networks.dual import LayerNorm, Linear, attention
 from lerobot_uca.networks.embeddings import TimeEmbedding
+from lerobot_uca.networks.forward_mode import LayerNorm, Linear, attention
 
 
 class SelfAttention(nn.Module):

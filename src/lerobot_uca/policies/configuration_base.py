@@ -8,7 +8,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.inference import INFERENCE
+from lerobot_uca.inference.backends import BACKENDS
 from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
 
@@ -87,8 +87,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         if self.dtype not in ("float32", "bfloat16"):
             raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
 
-        if self.inference not in INFERENCE:
-            raise UserError(f"policy.inference must be one of {', '.join(INFERENCE)}, got '{self.inference}'.")
+        if self.inference not in BACKENDS:
+            raise UserError(f"policy.inference must be one of {', '.join(BACKENDS)}, got '{self.inference}'.")
 
     def validate_features(self) -> None:
         """Keep of the dataset's features what the policy uses: a cloud, a state and an action.

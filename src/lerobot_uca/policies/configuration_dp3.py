@@ -6,11 +6,12 @@ from typing import override
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.inference import INFERENCE
+from lerobot_uca.inference.backends import BACKENDS
 from lerobot_uca.policies.configuration_unet import UNetPolicyConfig
+from lerobot_uca.registry import register
 
 
-@PreTrainedConfig.register_subclass("dp3")
+@register(PreTrainedConfig, "dp3")
 @dataclass
 class DP3Config(UNetPolicyConfig):
     """Configuration of `DP3Policy`."""
@@ -29,8 +30,8 @@ class DP3Config(UNetPolicyConfig):
                 f"got {self.n_inference_steps}."
             )
         if self.inference == "compile":
-            others = ", ".join(name for name in INFERENCE if name != "compile")
+            others = ", ".join(name for name in BACKENDS if name != "compile")
             raise UserError(
-                "policy.inference=compile is for policies of one network call (uca_flow, flow, mp1): the steps of "
-                f"'{self.type}' do not compile as one function. It must be one of {others}."
+                "policy.inference=compile is for policies of one network call (uca_flow, flowpolicy, mp1): the steps "
+                f"of '{self.type}' do not compile as one function. It must be one of {others}."
             )

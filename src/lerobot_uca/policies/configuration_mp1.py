@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_uca.policies.configuration_unet import UNetPolicyConfig
+from lerobot_uca.registry import register
 
 
-@PreTrainedConfig.register_subclass("mp1")
+@register(PreTrainedConfig, "mp1")
 @dataclass
 class MP1Config(UNetPolicyConfig):
     """Configuration of `MP1Policy`."""

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_uca.policies.configuration_dp3 import DP3Config
+from lerobot_uca.registry import register
 
 
-@PreTrainedConfig.register_subclass("simple_dp3")
+@register(PreTrainedConfig, "simple_dp3")
 @dataclass
 class SimpleDP3Config(DP3Config):
     """Configuration of `SimpleDP3Policy`: DP3 with a smaller U-Net."""

@@ -8,9 +8,10 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.registry import register
 
 
-@PreTrainedConfig.register_subclass("uca_flow")
+@register(PreTrainedConfig, "uca_flow")
 @dataclass
 class UCAFlowConfig(PointCloudPolicyConfig):
     """Configuration of `UCAFlowPolicy`. See `PointCloudPolicyConfig` for horizons, encoder and training recipe.

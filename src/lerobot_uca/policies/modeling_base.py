@@ -24,7 +24,7 @@ from torch import Tensor, nn
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.inference import INFERENCE
+from lerobot_uca.inference.backends import make_backend
 from lerobot_uca.networks.observation_encoder import ObservationEncoder
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 
@@ -86,7 +86,7 @@ class PointCloudPolicy(PreTrainedPolicy):
         self.model = Model(encoder, self.make_generator())
         self.ema_model = deepcopy(self.model).requires_grad_(False)
         self.register_buffer("ema_step", torch.zeros((), dtype=torch.long))
-        computed = INFERENCE[config.inference]
+        computed = make_backend(config.inference)
         self._encode_frame = computed(_encode_frame)
         self._plan = computed(self._encode_and_generate)
         self.reset()

@@ -6,7 +6,7 @@ from torch import nn
 from torch.autograd import forward_ad
 from torch.nn.functional import linear
 
-from lerobot_uca.networks.dual import LayerNorm, Linear, attention
+from lerobot_uca.networks.forward_mode import LayerNorm, Linear, attention
 
 LAYERS = {
     "Linear": lambda: Linear(6, 4),

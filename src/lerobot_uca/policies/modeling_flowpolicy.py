@@ -4,7 +4,7 @@ from torch import Tensor, nn
 
 from lerobot_uca.networks.unet1d import TimeUNet
 from lerobot_uca.objectives.consistency_flow import consistency_flow_loss, one_euler_step
-from lerobot_uca.policies.configuration_flow import FlowConfig
+from lerobot_uca.policies.configuration_flowpolicy import FlowConfig
 from lerobot_uca.policies.modeling_base import MethodLoss, PointCloudPolicy
 
 
@@ -12,7 +12,7 @@ class FlowPolicy(PointCloudPolicy):
     """Consistency flow matching with DP3's U-Net: one network call makes a chunk of actions."""
 
     config_class = FlowConfig
-    name = "flow"
+    name = "flowpolicy"
     config: FlowConfig
 
     def make_generator(self) -> nn.Module:

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from lerobot_uca.inference import CompiledFunction
+from lerobot_uca.inference.compiled import CompiledFunction
 
 
 def call(network: nn.Module, *inputs: torch.Tensor) -> tuple[torch.Tensor]:

@@ -1,6 +1,5 @@
 """Batched reading gives what stock reading gives, bit for bit and key for key."""
 
-import os
 import subprocess
 import sys
 
@@ -11,7 +10,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tests.conftest import N_ACTIONS, write_dataset
 from torch.utils.data import DataLoader, Subset, default_collate
 
-from lerobot_uca.data import reading
+from lerobot_uca.data import batched_dataset
+from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.features import OBS_POINT_CLOUD
 
 WINDOWS = {
@@ -22,7 +22,7 @@ WINDOWS = {
 
 
 def open_dataset(root, **options):
-    return LeRobotDataset("test/random", root=root, **options)
+    return BatchedDataset("test/random", root=root, **options)
 
 
 def assert_equal_batches(got, expected):
@@ -64,18 +64,17 @@ from torch.utils.data import DataLoader, default_collate, get_worker_info
 def collate(samples):
     # Runs in a worker. Nothing registers the plugin there: the dataset itself must bring batched reading along.
     dataset = get_worker_info().dataset
-    columns = dataset.__dict__["_decoded_columns"]
+    columns = dataset._decoded
     batched = hasattr(type(dataset), "__getitems__") and columns is not None
     shared = all(tensor.is_shared() for tensor in columns.tensors.values())
     return default_collate(samples), batched, shared
 
 if __name__ == "__main__":
-    import lerobot_policy_uca_flow
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot_uca.data.batched_dataset import BatchedDataset
 
     root, context = sys.argv[1:]
     windows = {"observation.point_cloud": [-1 / 80, 0], "action": [0, 1 / 80]}
-    dataset = LeRobotDataset("test/random", root=root, delta_timestamps=windows)
+    dataset = BatchedDataset("test/random", root=root, delta_timestamps=windows)
     loader = DataLoader(dataset, batch_size=5, num_workers=2, multiprocessing_context=context, collate_fn=collate)
     for n, (batch, batched, shared) in enumerate(loader):
         assert batched
@@ -131,10 +130,10 @@ def test_rows_that_do_not_exist(dataset_root):
 
 
 def test_a_dataset_above_the_size_limit_is_read_as_before(dataset_root, monkeypatch):
-    monkeypatch.setattr(reading, "MAX_BYTES", 100)
+    monkeypatch.setattr(batched_dataset, "MAX_BYTES", 100)
     dataset = open_dataset(dataset_root, delta_timestamps=WINDOWS)
     assert_equal_batches(dataset.__getitems__([4])[0], dataset[4])
-    assert dataset.__dict__["_decoded_columns"] is None
+    assert dataset._decoded is None
 
 
 def test_image_datasets_are_read_as_before(tmp_path):
@@ -152,9 +151,9 @@ def test_image_datasets_are_read_as_before(tmp_path):
         )
     dataset.save_episode()
     dataset.finalize()
-    dataset = LeRobotDataset("test/images", root=tmp_path / "d")
+    dataset = BatchedDataset("test/images", root=tmp_path / "d")
     assert_equal_batches(dataset.__getitems__([2])[0], dataset[2])
-    assert dataset.__dict__["_decoded_columns"] is None
+    assert dataset._decoded is None
 
 
 def test_other_number_types_keep_their_values(tmp_path):
@@ -167,22 +166,3 @@ def test_other_number_types_keep_their_values(tmp_path):
     dataset = open_dataset(tmp_path / "d", delta_timestamps={"observation.grid": [-1 / 80, 0]})
     for index in (0, 5, len(dataset) - 1):
         assert_equal_batches(dataset.__getitems__([index])[0], dataset[index])
-
-
-@pytest.mark.parametrize("switch", ["0", "1"])
-def test_switch(switch):
-    code = (
-        "import lerobot_policy_uca_flow\n"
-        "from lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
-        "print(hasattr(LeRobotDataset, '__getitems__'))"
-    )
-    variables = {**os.environ, reading.SWITCH: switch}
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=variables)
-    assert result.stdout.strip() == str(switch == "1")
-
-
-def test_another_lerobot_is_left_alone(monkeypatch):
-    monkeypatch.setattr(reading.lerobot, "__version__", "0.7.0")
-    monkeypatch.delattr(LeRobotDataset, "__getitems__")
-    reading._install()
-    assert not hasattr(LeRobotDataset, "__getitems__")

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_uca.envs.adroit import AdroitPointCloudEnv, make_simulator
-from lerobot_uca.envs.dapg_pickle import read_policy
-from lerobot_uca.envs.point_cloud import Array
+from lerobot_uca.envs.experts.dapg_pickle import read_policy
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.geometry import Array
 
 Weights = NDArray[np.float32]
 

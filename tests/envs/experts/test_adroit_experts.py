@@ -7,8 +7,8 @@ import pytest
 
 from lerobot_uca.data.demonstrations import demonstrate
 from lerobot_uca.envs.adroit import AdroitPointCloudEnv, make_simulator
-from lerobot_uca.envs.adroit_experts import Replay, attempts
-from lerobot_uca.envs.dapg import DAPGExpert, DAPGWeights
+from lerobot_uca.envs.experts.adroit_experts import Replay, attempts
+from lerobot_uca.envs.experts.dapg import DAPGExpert, DAPGWeights
 from lerobot_uca.errors import UserError
 
 minari = pytest.importorskip("minari")

@@ -14,7 +14,7 @@ import torch
 from torch.autograd.variable import Variable
 
 from lerobot_uca.envs.adroit import TASKS, make_simulator
-from lerobot_uca.envs.dapg import DAPGExpert, DAPGWeights
+from lerobot_uca.envs.experts.dapg import DAPGExpert, DAPGWeights
 from lerobot_uca.errors import UserError
 
 N_IN, N_HIDDEN, N_OUT = 39, (5, 4), 28

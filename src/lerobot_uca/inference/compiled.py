@@ -1,6 +1,5 @@
-"""What computes a policy's networks at inference: `policy.inference` names one of `INFERENCE`."""
+"""Networks compiled by `torch.compile`, on a GPU with CUDA graphs."""
 
-from collections.abc import Callable
 from textwrap import shorten
 
 import torch
@@ -8,7 +7,7 @@ from torch import Tensor, nn
 from torch._dynamo.exc import FailOnRecompileLimitHit, ShortenTraceback
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.traced import BFloat16Function, Function, OnnxFunction, OpenVinoFunction
+from lerobot_uca.inference.backends import Function
 
 
 class CompiledFunction:
@@ -50,12 +49,3 @@ class CompiledFunction:
                 f"openvino need none: {shorten(reason, 300)}"
             ) from error
         return tuple(result.clone() for result in results)  # a CUDA graph writes its next results to the same place
-
-
-INFERENCE: dict[str, Callable[[Function], Function]] = {
-    "eager": lambda function: function,
-    "openvino": OpenVinoFunction,
-    "openvino_bfloat16": BFloat16Function,
-    "onnxruntime": OnnxFunction,
-    "compile": CompiledFunction,
-}

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.inference.traced import to_onnx
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
-from lerobot_uca.traced import to_onnx
 
 # What these steps do is the same for all observations, so that a trace of it holds.
 TRACEABLE_STEPS = {

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_uca.envs.point_cloud import Camera, Crop
-from lerobot_uca.envs.ray_casting import BACKGROUND, Marker, PictureCamera, PointCloudCamera, surface_colours
+from lerobot_uca.point_clouds.cameras import BACKGROUND, Marker, PictureCamera, PointCloudCamera, shade, surface_colours
+from lerobot_uca.point_clouds.geometry import Camera, Crop
 
 SCENE = """
 <mujoco>
@@ -34,7 +34,7 @@ MOVING_SCENE = """
 </mujoco>
 """
 LOOKING_DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-CAMERA = Camera("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, 40, 40)
+CAMERA = Camera.from_fovy("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, (40, 40))
 EVERYTHING = Crop((-9, -9, -9), (9, 9, 9))
 
 
@@ -47,7 +47,7 @@ def scene():
 
 
 def points_of_single_rays(model: mujoco.MjModel, data: mujoco.MjData) -> list[np.ndarray]:
-    origin = np.asarray(CAMERA.position)
+    origin = CAMERA.position
     points = []
     for direction in CAMERA.ray_directions():
         hit = np.zeros(1, dtype=np.int32)
@@ -102,7 +102,7 @@ def test_markers_are_seen_and_hidden_like_solid_spheres(scene):
 def test_a_picture_shows_surfaces_in_their_colours(scene):
     model, data = scene
     marker = Marker(np.array([-0.6, 0, 0.2]), 0.15, np.array([0, 1.0, 0]))
-    camera = Camera("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, 41, 41)
+    camera = Camera.from_fovy("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, (41, 41))
     picture = PictureCamera(camera).capture(model, data, [marker])
     assert picture.shape == (41, 41, 3)
     assert picture.dtype == np.uint8
@@ -117,7 +117,7 @@ def test_a_picture_shows_surfaces_in_their_colours(scene):
 
 def test_where_there_is_nothing_the_picture_shows_the_background(scene):
     model, data = scene
-    looking_up = Camera("up", (0.0, 0.0, 2.0), ((1.0, 0, 0), (0, -1.0, 0), (0, 0, -1.0)), 60.0, 8, 8)
+    looking_up = Camera.from_fovy("up", (0.0, 0.0, 2.0), ((1.0, 0, 0), (0, -1.0, 0), (0, 0, -1.0)), 60.0, (8, 8))
     assert (PictureCamera(looking_up).capture(model, data) == BACKGROUND).all()
     assert len(PointCloudCamera(looking_up, EVERYTHING).capture(model, data)) == 0
 
@@ -127,3 +127,12 @@ def test_colours_come_from_the_geom_its_material_and_texture(scene):
     np.testing.assert_allclose(colours[0], [128 / 255, 128 / 255, 0], atol=0.01)
     np.testing.assert_allclose(colours[1], [1, 0, 0])
     np.testing.assert_allclose(colours[2], [0, 0, 1])
+
+
+def test_surfaces_facing_the_camera_are_brighter():
+    colours = np.ones((2, 3))
+    directions = np.array([[0, 0, -1.0]] * 2)
+    picture = shade(colours, np.array([[0, 0, 1.0], [1.0, 0, 0]]), directions)
+    assert picture.dtype == np.uint8
+    assert (picture[0] == 255).all()
+    assert (picture[1] < picture[0]).all()

@@ -11,14 +11,14 @@ import onnxruntime
 import pytest
 import torch
 from lerobot.policies import make_policy_config, make_pre_post_processors
+from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_config
 
 from lerobot_uca import onnx_runner
+from lerobot_uca.deploy.export import export
+from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.errors import UserError
-from lerobot_uca.export import export
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.onnx_runner import OnnxPolicy
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
-from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_config
 
 
 def save(folder: Path, **changes: object) -> UCAFlowPolicy:
@@ -167,7 +167,7 @@ def test_a_file_that_cannot_be_written(checkpoint, tmp_path):
 
 
 def test_nothing_is_written_if_onnxruntime_computes_something_else(checkpoint, tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_uca.export.TOLERANCE", 0.0)  # not even rounding
+    monkeypatch.setattr("lerobot_uca.deploy.export.TOLERANCE", 0.0)  # not even rounding
     with pytest.raises(UserError, match=r"computes other actions than the policy: .* Nothing was written"):
         export(str(checkpoint), tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())

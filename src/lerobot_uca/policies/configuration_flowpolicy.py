@@ -7,9 +7,10 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.configuration_unet import UNetPolicyConfig
+from lerobot_uca.registry import register
 
 
-@PreTrainedConfig.register_subclass("flow")
+@register(PreTrainedConfig, "flowpolicy")
 @dataclass
 class FlowConfig(UNetPolicyConfig):
     """Configuration of `FlowPolicy`. Time runs from noise at 0 to data at 1."""
@@ -31,3 +32,6 @@ class FlowConfig(UNetPolicyConfig):
                 raise UserError(f"policy.{name} must be between 0 and 1, got {getattr(self, name)}.")
         if self.n_segments < 1:
             raise UserError(f"policy.n_segments must be at least 1, got {self.n_segments}.")
+
+
+register(PreTrainedConfig, "flow")(FlowConfig)  # the type's name until 0.1: checkpoints that hold it still load

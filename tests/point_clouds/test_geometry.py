@@ -1,13 +1,21 @@
 import numpy as np
 import pytest
 
-from lerobot_uca.envs.point_cloud import Camera, Crop, ray_sphere_distances, sample_farthest, shade
+from lerobot_uca.point_clouds.geometry import (
+    Camera,
+    Crop,
+    as_pose,
+    opencv_from_opengl,
+    opengl_from_opencv,
+    ray_sphere_distances,
+    sample_farthest,
+)
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def camera(width: int = 4, height: int = 2, fovy: float = 90.0) -> Camera:
-    return Camera("test", (0.0, 0.0, 0.0), IDENTITY, fovy, width, height)
+    return Camera.from_fovy("test", (0.0, 0.0, 0.0), IDENTITY, fovy, (width, height))
 
 
 def test_rays_of_a_small_camera_are_those_computed_by_hand():
@@ -19,8 +27,46 @@ def test_rays_of_a_small_camera_are_those_computed_by_hand():
 
 def test_rotation_turns_the_camera_frame_into_the_world_frame():
     looks_along_x = ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))  # camera x, y, z in the world: -y, z, -x
-    mean = Camera("test", (0.0, 0.0, 0.0), looks_along_x, 60.0, 8, 8).ray_directions().mean(axis=0)
+    mean = Camera.from_fovy("test", (0.0, 0.0, 0.0), looks_along_x, 60.0, (8, 8)).ray_directions().mean(axis=0)
     np.testing.assert_allclose(mean / np.linalg.norm(mean), [1, 0, 0], atol=1e-12)
+
+
+def random_camera(rng: np.random.Generator) -> Camera:
+    X = np.eye(4)
+    X[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    X[:3, :3] *= np.sign(np.linalg.det(X[:3, :3]))
+    X[:3, 3] = rng.normal(size=3)
+    return Camera("random", 31.0, 29.0, 10.3, 7.8, 24, 16, as_pose(X))
+
+
+def test_conventions_differ_in_y_and_z():
+    """A point right, above and in front of the camera has these coordinates in either convention."""
+    in_opengl, in_opencv = np.array([0.1, 0.2, -1.0, 1]), np.array([0.1, -0.2, 1.0, 1])
+    X = np.asarray(random_camera(np.random.default_rng(0)).X_world_camera)
+    np.testing.assert_allclose(opengl_from_opencv(X) @ in_opengl, X @ in_opencv)
+    np.testing.assert_array_equal(opencv_from_opengl(opengl_from_opencv(X)), X)
+
+
+def test_unproject_is_the_inverse_of_ray_directions():
+    rng = np.random.default_rng(0)
+    camera = random_camera(rng)
+    distances = rng.uniform(0.3, 4, camera.width * camera.height)
+    points = camera.position + camera.ray_directions() * distances[:, None]
+    np.testing.assert_allclose(camera.unproject(camera.depth(distances)), points, atol=1e-12)
+
+
+def test_a_point_comes_back_from_the_pixel_and_depth_that_it_projects_to():
+    camera = random_camera(np.random.default_rng(1))
+    u, v, z = 5, 11, 1.7
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    point = np.asarray(camera.X_world_camera) @ [*(np.linalg.inv(K) @ [u, v, 1] * z), 1]
+    depth = np.full((camera.height, camera.width), z)
+    np.testing.assert_allclose(camera.unproject(depth)[v * camera.width + u], point[:3])
+
+
+def test_a_depth_of_another_camera_is_refused():
+    with pytest.raises(ValueError, match=r"of camera 'random' has shape \(16, 24\), got \(24, 16\)"):
+        random_camera(np.random.default_rng(0)).unproject(np.ones((24, 16)))
 
 
 def test_a_ray_is_inside_a_crop_exactly_between_entering_and_leaving():
@@ -81,12 +127,3 @@ def test_too_few_points_are_repeated_in_turn():
 def test_an_empty_cloud_is_an_error():
     with pytest.raises(ValueError, match="empty"):
         sample_farthest(np.empty((0, 3)), 10)
-
-
-def test_surfaces_facing_the_camera_are_brighter():
-    colours = np.ones((2, 3))
-    directions = np.array([[0, 0, -1.0]] * 2)
-    picture = shade(colours, np.array([[0, 0, 1.0], [1.0, 0, 0]]), directions)
-    assert picture.dtype == np.uint8
-    assert (picture[0] == 255).all()
-    assert (picture[1] < picture[0]).all()

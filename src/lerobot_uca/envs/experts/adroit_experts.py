@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_uca.envs.adroit import ACTION_REPEAT, AdroitPointCloudEnv, make_simulator
-from lerobot_uca.envs.dapg import DAPGExpert, DAPGWeights
-from lerobot_uca.envs.expert import Attempt, attempts_by_seed
-from lerobot_uca.envs.point_cloud import Array
+from lerobot_uca.envs.experts.dapg import DAPGExpert, DAPGWeights
+from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.geometry import Array
 
 MINARI = "minari:"
 HOW_TO_GET_ONE = (

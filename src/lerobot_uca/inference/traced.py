@@ -12,13 +12,12 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from textwrap import shorten
-from typing import ClassVar, override
+from typing import ClassVar
 
-import numpy as np
-import onnxruntime
-import openvino
 import torch
 from torch import Tensor, nn
+
+from lerobot_uca.inference.backends import Function
 
 logger = logging.getLogger(__name__)
 
@@ -26,8 +25,6 @@ OPSET = 17  # the first with LayerNormalization
 WEIGHTS_PER_THREAD = 900_000
 """A second thread pays from about twice so many weights, those of all samples of a batch counted together."""
 
-Function = Callable[..., tuple[Tensor, ...]]
-"""function(network, *inputs)."""
 Run = Callable[[Sequence[Tensor]], tuple[Tensor, ...]]
 """A trace, opened by a runtime: float32 inputs to results."""
 
@@ -111,69 +108,6 @@ class TracedFunction(ABC):
 
     def _is_close(self, result: Tensor, expected: Tensor) -> bool:
         return bool((result - expected).abs().max() <= self.tolerance * expected.abs().max())
-
-
-class OnnxFunction(TracedFunction):
-    """Computed by ONNX Runtime."""
-
-    runtime = f"ONNX Runtime {onnxruntime.__version__}"
-
-    @override
-    def open(self, model: bytes, input_shapes: Sequence[torch.Size], n_threads: int) -> Run:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = n_threads
-        # Between calls the cores belong to others, to the simulator for example.
-        options.add_session_config_entry("session.force_spinning_stop", "1")
-        options.log_severity_level = 3
-        session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        names = [tensor.name for tensor in session.get_inputs()]
-
-        def run(inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-            feeds = {name: tensor.numpy() for name, tensor in zip(names, inputs, strict=True)}
-            return tuple(map(torch.from_numpy, session.run(None, feeds)))
-
-        return run
-
-
-class OpenVinoFunction(TracedFunction):
-    """Computed by OpenVINO."""
-
-    runtime = f"OpenVINO {openvino.__version__}"
-    precision: ClassVar[str] = "f32"
-
-    @override
-    def open(self, model: bytes, input_shapes: Sequence[torch.Size], n_threads: int) -> Run:
-        core = openvino.Core()
-        has_bfloat16 = "BF16" in core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-        settings = {
-            "INFERENCE_PRECISION_HINT": self.precision if has_bfloat16 else "f32",
-            "INFERENCE_NUM_THREADS": n_threads,
-            "NUM_STREAMS": 1,
-            # Its fused attention gives wrong numbers where fewer tokens ask than answer, as in the last block (2025.4
-            # and 2026.4); the operations one by one take as long.
-            "SNIPPETS_MODE": "DISABLE",
-        }
-        request = core.compile_model(core.read_model(model), "CPU", settings).create_infer_request()
-        held = [np.empty(shape, np.float32) for shape in input_shapes]
-        for index, array in enumerate(held):
-            request.set_input_tensor(index, openvino.Tensor(array, shared_memory=True))
-        results = [tensor.data for tensor in request.output_tensors]
-
-        def run(inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-            # NumPy copies: a thread that PyTorch has just used would spin on the core that OpenVINO's second one needs.
-            for array, tensor in zip(held, inputs, strict=True):
-                array[...] = tensor.numpy()
-            request.infer(share_outputs=True)
-            return tuple(torch.from_numpy(result.copy()) for result in results)  # the next call overwrites them
-
-        return run
-
-
-class BFloat16Function(OpenVinoFunction):
-    """Computed by OpenVINO in bfloat16 where the processor has instructions for it: less exact, faster."""
-
-    precision = "bf16"
-    tolerance = 0.05
 
 
 def to_onnx(

@@ -9,8 +9,10 @@ import torch
 from onnxruntime.capi import onnxruntime_pybind11_state as onnxruntime_errors
 from torch import nn
 
+from lerobot_uca.inference.onnxruntime_function import OnnxFunction
+from lerobot_uca.inference.openvino_function import BFloat16Function, OpenVinoFunction
+from lerobot_uca.inference.traced import to_onnx
 from lerobot_uca.networks.transformer import UnifiedTransformer
-from lerobot_uca.traced import BFloat16Function, OnnxFunction, OpenVinoFunction, to_onnx
 
 every_runtime = pytest.mark.parametrize("runtime", [OpenVinoFunction, OnnxFunction])
 

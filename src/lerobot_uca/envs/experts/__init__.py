@@ -1,0 +1,1 @@
+"""Demonstrators of the simulated tasks."""

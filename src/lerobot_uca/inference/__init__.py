@@ -1,0 +1,1 @@
+"""How networks are computed at inference: PyTorch, traced runtimes, torch.compile."""

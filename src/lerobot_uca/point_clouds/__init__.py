@@ -1,0 +1,1 @@
+"""Point clouds: geometry, ray casting and cameras. Imports nothing else of this package."""

@@ -1,0 +1,115 @@
+"""Cameras that see a MuJoCo scene by ray casting.
+
+Like MuJoCo's own renderer they see the geoms of the visible groups and the task's markers (goal sites, which are no
+geoms and which `mj_multiRay` therefore passes through).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, ray_sphere_distances
+from lerobot_uca.point_clouds.ray_casting import RayCaster
+
+ROUNDING = 1e-9  # [m], far above that of a distance and far below what a camera resolves
+BACKGROUND = np.array([235, 238, 242], dtype=np.uint8)
+DEFAULT_GEOM_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
+
+
+class Marker(NamedTuple):
+    """A sphere that shows where a goal is: centre [m, world], radius [m], RGB colour in [0, 1]."""
+
+    centre: Array
+    radius: float
+    colour: Array
+
+
+class PointCloudCamera:
+    """Sees the part of the scene inside a crop as points.
+
+    Args:
+        camera: where the rays start and which way they go.
+        crop: what to keep. Rays that miss it are never cast.
+    """
+
+    def __init__(self, camera: Camera, crop: Crop) -> None:
+        origin = camera.position
+        directions = camera.ray_directions()
+        self.camera, self.crop = camera, crop
+        enter, leave = crop.span(origin, directions)
+        meets = enter <= leave
+        self._caster = RayCaster(origin, directions[meets], with_normals=False)
+        self._enter, self._leave = enter[meets] - ROUNDING, leave[meets] + ROUNDING
+
+    def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
+        """Visible points inside the crop, (N, 3), world frame [m]. `data` must be up to date (`mj_forward`)."""
+        caster = self._caster
+        distance = caster.cast(model, data).distance
+        for marker in markers:
+            to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)
+            np.minimum(distance, to_marker, out=distance)
+        near = (distance >= self._enter) & (distance <= self._leave)
+        points = caster.origin + caster.directions[near] * distance[near, None]
+        return points[self.crop.contains(points)]
+
+
+class PictureCamera:
+    """Sees the scene as a shaded picture: the colour of each surface, lit from the camera."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self._caster = RayCaster(camera.position, camera.ray_directions(), with_normals=True)
+
+    def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> NDArray[np.uint8]:
+        """The picture, (H, W, 3) uint8."""
+        caster = self._caster
+        distance, geom, normal = caster.cast(model, data)
+        colour = surface_colours(model)[geom]
+        for marker in markers:
+            to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)
+            nearer = to_marker < distance
+            surface = caster.origin + caster.directions[nearer] * to_marker[nearer, None]
+            normal[nearer] = (surface - marker.centre) / marker.radius
+            colour[nearer] = marker.colour
+            np.minimum(distance, to_marker, out=distance)
+        picture = shade(colour, normal, caster.directions)
+        picture[np.isinf(distance)] = BACKGROUND
+        return picture.reshape(self.camera.height, self.camera.width, 3)
+
+
+def shade(colours: Array, normals: Array, directions: Array) -> NDArray[np.uint8]:
+    """A picture of surfaces lit from the camera: (R, 3) uint8.
+
+    Args:
+        colours: of the surfaces, RGB in [0, 1], (R, 3).
+        normals: unit surface normals, (R, 3), of either sign.
+        directions: unit viewing directions, (R, 3).
+    """
+    facing = np.abs(np.einsum("rc,rc->r", normals, directions))
+    return np.round(255 * np.clip(colours * (0.35 + 0.65 * facing[:, None]), 0, 1)).astype(np.uint8)
+
+
+def surface_colours(model: mujoco.MjModel) -> Array:
+    """One RGB colour in [0, 1] for each geom, (ngeom, 3): its own or its material's, times its texture's mean."""
+    own = np.any(model.geom_rgba != DEFAULT_GEOM_COLOUR, axis=1)
+    has_material = model.geom_matid >= 0
+    if model.nmat == 0:
+        return model.geom_rgba[:, :3].astype(np.float64)
+    material_colours = np.array([_material_colour(model, material) for material in range(model.nmat)])
+    from_material = has_material & ~own
+    return np.where(from_material[:, None], material_colours[model.geom_matid], model.geom_rgba[:, :3])
+
+
+def _material_colour(model: mujoco.MjModel, material: int) -> Array:
+    colour = model.mat_rgba[material, :3].astype(np.float64)
+    texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    if texture < 0:
+        return colour
+    start = model.tex_adr[texture]
+    channels = model.tex_nchannel[texture]
+    size = model.tex_height[texture] * model.tex_width[texture] * channels
+    texels = model.tex_data[start : start + size].reshape(-1, channels)[:, :3]
+    return colour * texels.mean(axis=0) / 255

@@ -1,0 +1,189 @@
+"""What this package changes in LeRobot, and what it leaves alone."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import factory
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.act.configuration_act import ACTConfig
+
+from lerobot_uca import lerobot_patches
+from lerobot_uca.data import batched_dataset
+from lerobot_uca.data.batched_dataset import BatchedDataset
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from tests.conftest import N_ACTIONS, N_POINTS, N_STATES
+
+
+def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **variables})
+
+
+def training(root: Path, output: Path, policy: type = UCAFlowConfig, **options: object) -> TrainPipelineConfig:
+    return TrainPipelineConfig(
+        dataset=DatasetConfig(repo_id="test/random", root=str(root)),
+        policy=policy(device="cpu", push_to_hub=False),
+        output_dir=output / "new",
+        **options,
+    )
+
+
+def workers(monkeypatch, config: TrainPipelineConfig, *arguments: str) -> int:
+    """What lerobot-train would use: it validates, makes the dataset, then its loader."""
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
+    config.validate()
+    factory.make_train_eval_datasets(config)
+    return config.num_workers
+
+
+# Workers ------------------------------------------------------------------------------------------------------------
+
+
+def test_batched_reading_needs_no_workers_and_says_so(monkeypatch, dataset_root, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    assert workers(monkeypatch, training(dataset_root, tmp_path)) == 0
+    assert "Batched reading needs no workers: num_workers is 0. --num_workers=N asks for some." in caplog.messages
+
+
+@pytest.mark.parametrize("split", [0.0, 0.4])
+def test_datasets_of_a_training_are_read_in_batches(dataset_root, tmp_path, split):
+    config = training(dataset_root, tmp_path)
+    config.dataset.eval_split = split
+    for dataset in factory.make_train_eval_datasets(config):
+        assert dataset is None or (isinstance(dataset, BatchedDataset) and dataset.is_batched)
+
+
+def test_chosen_workers_stay(monkeypatch, dataset_root, tmp_path):
+    assert workers(monkeypatch, training(dataset_root, tmp_path), "--num_workers=4") == 4
+    assert workers(monkeypatch, training(dataset_root, tmp_path, num_workers=4), "--num_workers", "4") == 4
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.yaml", "num_workers: 4\n"), ("train_config.json", '{"num_workers": 4}')]
+)
+def test_workers_chosen_in_a_file_stay(monkeypatch, dataset_root, tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    config = training(dataset_root, tmp_path)
+    assert workers(monkeypatch, config, f"--config_path={tmp_path / name}") == 4
+    (tmp_path / "other.yaml").write_text("batch_size: 4\n")
+    assert workers(monkeypatch, training(dataset_root, tmp_path), f"--config_path={tmp_path / 'other.yaml'}") == 0
+    if name == "train_config.json":  # LeRobot takes the folder, too
+        assert workers(monkeypatch, training(dataset_root, tmp_path), f"--config_path={tmp_path}") == 4
+
+
+def test_other_policies_keep_lerobots_workers(monkeypatch, dataset_root, tmp_path):
+    assert workers(monkeypatch, training(dataset_root, tmp_path, ACTConfig)) == 4
+
+
+def test_datasets_above_the_size_limit_keep_lerobots_workers(monkeypatch, dataset_root, tmp_path):
+    monkeypatch.setattr(batched_dataset, "MAX_BYTES", 100)
+    assert workers(monkeypatch, training(dataset_root, tmp_path)) == 4
+
+
+@pytest.mark.parametrize(
+    ("key", "feature", "value"),
+    [
+        (
+            "observation.images.top",
+            {"dtype": "image", "shape": (8, 8, 3), "names": None},
+            np.zeros((8, 8, 3), np.uint8),
+        ),
+        ("note", {"dtype": "string", "shape": (1,), "names": None}, "a text"),
+    ],
+)
+def test_datasets_with_images_or_text_keep_lerobots_workers(monkeypatch, tmp_path, key, feature, value):
+    features = {
+        OBS_POINT_CLOUD: {"dtype": "float32", "shape": (N_POINTS, 3), "names": None},
+        "observation.state": {"dtype": "float32", "shape": (N_STATES,), "names": None},
+        "action": {"dtype": "float32", "shape": (N_ACTIONS,), "names": None},
+        key: feature,
+    }
+    dataset = LeRobotDataset.create("test/random", fps=10, features=features, root=tmp_path / "d", use_videos=False)
+    for _ in range(3):
+        numbers = {k: np.zeros(f["shape"], np.float32) for k, f in features.items() if f["dtype"] == "float32"}
+        dataset.add_frame({**numbers, key: value, "task": "none"})
+    dataset.save_episode()
+    dataset.finalize()
+    assert workers(monkeypatch, training(tmp_path / "d", tmp_path)) == 4
+
+
+@pytest.mark.parametrize(("switch", "expected"), [("0", "LeRobotDataset"), ("1", "BatchedDataset")])
+def test_switch(switch, expected):
+    code = (
+        "import lerobot_policy_uca_flow\nfrom lerobot.datasets import factory\nprint(factory.LeRobotDataset.__name__)"
+    )
+    assert run(code, **{lerobot_patches.SWITCH: switch}).stdout.strip() == expected
+
+
+def test_only_the_dataset_factory_knows_the_batched_dataset():
+    assert factory.LeRobotDataset is BatchedDataset
+    assert not hasattr(LeRobotDataset, "__getitems__")
+
+
+def test_another_lerobot_is_left_alone():
+    code = (
+        "import lerobot; lerobot.__version__ = '0.7.0'\n"
+        "import lerobot_policy_uca_flow\n"
+        "from lerobot.datasets import factory\n"
+        "print(factory.LeRobotDataset.__name__)"
+    )
+    assert run(code).stdout.strip() == "LeRobotDataset"
+
+
+def test_installing_twice_changes_nothing():
+    before = (factory.make_dataset, factory.LeRobotDataset, TrainPipelineConfig.validate, sys.excepthook)
+    lerobot_patches.install()
+    assert before == (factory.make_dataset, factory.LeRobotDataset, TrainPipelineConfig.validate, sys.excepthook)
+
+
+# Errors and noise ---------------------------------------------------------------------------------------------------
+
+
+def test_a_users_error_is_one_line():
+    result = run("import lerobot_policy_uca_flow\nfrom lerobot_uca.errors import UserError\nraise UserError('mend it')")
+    assert result.returncode == 1
+    assert result.stderr.strip() == "error: mend it"
+
+
+@pytest.mark.parametrize("error", ["PermissionError(13, 'no')", "OSError(28, 'no space')", "ValueError('other')"])
+def test_other_errors_keep_their_traceback(error):
+    result = run(f"import lerobot_policy_uca_flow\nraise {error}")
+    assert result.returncode == 1
+    assert result.stderr.startswith("Traceback")
+
+
+def test_the_decoders_warning_is_one_line_and_once(caplog):
+    target = logging.getLogger("lerobot.utils.import_utils")
+    lerobot_patches.shorten_decoder_warning()
+    for each in target.filters:
+        each._said = False
+    for _ in range(3):
+        target.warning("Traceback\n" * 40 + "'torchcodec' is installed but cannot be loaded (see above)")
+        target.warning("something else")
+    (line,) = [message for message in caplog.messages if "torchcodec" in message]
+    assert line == "torchcodec cannot be loaded (no FFmpeg?): pyav decodes videos, if there are any."
+    assert caplog.messages.count("something else") == 3
+
+
+def test_an_output_folder_that_cannot_be_made_is_refused(dataset_root, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="file' is not a writable folder"):
+        training(dataset_root, tmp_path / "file").validate()
+    training(dataset_root, tmp_path / "file", ACTConfig).validate()  # LeRobot's own policies find out as before
+
+
+def test_the_settings_of_a_training_are_saved_as_they_were_used(monkeypatch, dataset_root, tmp_path):
+    config = training(dataset_root, tmp_path)
+    assert workers(monkeypatch, config) == 0
+    config.save_pretrained(tmp_path)
+    assert json.loads((tmp_path / "train_config.json").read_text())["num_workers"] == 0
