@@ -38,14 +38,20 @@ def install() -> None:
 
 
 def report_user_errors() -> None:
-    """A `UserError` ends the process with its message in one line. Python prints a traceback for it."""
+    """A `UserError` ends the process with its message in one line, also when draccus has wrapped it.
+
+    Python prints a traceback for it.
+    """
     previous = sys.excepthook
     if getattr(previous, "_reports_user_errors", False):
         return
 
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if isinstance(error, UserError):
-            print(f"error: {error}", file=sys.stderr)
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, UserError):
+            cause = cause.__cause__
+        if cause is not None:
+            print(f"error: {cause}", file=sys.stderr)
         else:
             previous(kind, error, traceback)
 

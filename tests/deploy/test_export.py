@@ -13,7 +13,7 @@ import torch
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_config
 
-from lerobot_uca import onnx_runner
+from lerobot_uca.deploy import onnx_runner
 from lerobot_uca.deploy.export import export
 from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.errors import UserError
