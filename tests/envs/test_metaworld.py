@@ -14,7 +14,7 @@ from lerobot_uca.envs.metaworld import (
     task_groups,
 )
 from lerobot_uca.errors import UserError
-from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.point_clouds.geometry import Crop, opengl_from_opencv
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +39,11 @@ def test_the_camera_is_metaworlds_corner2_moved(env):
     camera = simulator.model.camera("corner2").id
     simulator.model.cam_pos[camera] = CLOUD_CAMERA.position
     mujoco.mj_forward(simulator.model, simulator.data)
-    np.testing.assert_allclose(simulator.data.cam_xmat[camera].reshape(3, 3), CLOUD_CAMERA.rotation, atol=1e-12)
+    rotation = opengl_from_opencv(np.asarray(CLOUD_CAMERA.X_world_camera))[:3, :3]
+    np.testing.assert_allclose(simulator.data.cam_xmat[camera].reshape(3, 3), rotation, atol=1e-12)
     np.testing.assert_allclose(simulator.data.cam_xpos[camera], CLOUD_CAMERA.position)
-    assert simulator.model.cam_fovy[camera] == CLOUD_CAMERA.fovy
+    fovy = 2 * np.degrees(np.arctan(CLOUD_CAMERA.height / 2 / CLOUD_CAMERA.fy))
+    assert simulator.model.cam_fovy[camera] == pytest.approx(fovy)
     assert simulator.dt == pytest.approx(1 / metaworld.FPS)
 
 

@@ -87,7 +87,7 @@ class Camera:
     @property
     def position(self) -> Array:
         """In the world, (3,) [m]."""
-        return np.asarray(self.X_world_camera)[:3, 3]
+        return np.array(self.X_world_camera)[:3, 3].copy()
 
     def ray_directions(self) -> Array:
         """Unit vectors through the pixel centres, (R, 3), world frame."""
