@@ -1,24 +1,17 @@
-"""Shared fixtures: everything tiny, real where it can be."""
+"""Shared fixtures: everything tiny, real where it can be. The functions that make things are in builders.py."""
 
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")  # no test may need the network
 
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
 import lerobot_policy_uca_flow  # noqa: F401  (registers everything, as LeRobot's commands do)
-from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
-from lerobot_uca.policies.modeling_base import PointCloudPolicy
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from tests.builders import make_config, write_dataset
 
-N_POINTS, N_STATES, N_ACTIONS = 32, 9, 4
 ADROIT_EXPERTS = Path(__file__).parents[2] / "shared" / "adroit_experts"
 """Weights are data, not code: they lie beside the project."""
 
@@ -44,58 +37,6 @@ def _one_thread() -> None:
     torch.manual_seed(0)
 
 
-TINY_UNET = {"point_widths": (16, 32), "unet_widths": (16, 32), "unet_blocks": 1, "time_dim": 16}
-SMALL_POLICIES: dict[str, dict] = {
-    "uca_flow": {
-        "point_widths": (16, 32),
-        "dim": 32,
-        "n_layers": 2,
-        "n_heads": 2,
-        "n_timestep_tokens": 2,
-        "n_interval_tokens": 2,
-    },
-    **dict.fromkeys(("dp3", "simple_dp3", "flowpolicy", "mp1"), TINY_UNET),
-}
-"""Sizes small enough for a test, by policy type."""
-
-
-def make_settings() -> dict:
-    """What every configuration needs besides sizes."""
-    return {
-        "input_features": {
-            OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (N_POINTS, 3)),
-            "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
-        },
-        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))},
-        "device": "cpu",
-        "push_to_hub": False,
-    }
-
-
-def make_config(**changes: object) -> UCAFlowConfig:
-    """A UCA-Flow configuration small enough for a test."""
-    return UCAFlowConfig(**{**make_settings(), **SMALL_POLICIES["uca_flow"], **changes})
-
-
-def make_batch(config: UCAFlowConfig, batch_size: int = 8) -> dict[str, torch.Tensor]:
-    """A batch of training windows with values in [-1, 1]."""
-    n_obs = config.n_obs_steps
-    return {
-        OBS_POINT_CLOUD: torch.rand(batch_size, n_obs, N_POINTS, 3) * 2 - 1,
-        "observation.state": torch.rand(batch_size, n_obs, N_STATES) * 2 - 1,
-        "action": torch.rand(batch_size, config.horizon, N_ACTIONS) * 2 - 1,
-        "action_is_pad": torch.zeros(batch_size, config.horizon, dtype=torch.bool),
-    }
-
-
-def make_observation(batch_size: int = 1) -> dict[str, torch.Tensor]:
-    """One step's observation."""
-    return {
-        OBS_POINT_CLOUD: torch.rand(batch_size, N_POINTS, 3),
-        "observation.state": torch.rand(batch_size, N_STATES),
-    }
-
-
 @pytest.fixture
 def policy() -> UCAFlowPolicy:
     """An untrained policy in eval mode, whose averaged weights differ from its trained ones."""
@@ -106,57 +47,9 @@ def policy() -> UCAFlowPolicy:
     return policy.eval()
 
 
-def write_dataset(
-    root: Path, *, n_episodes: int = 3, length: int = 12, features: dict | None = None, point_cloud: object = None
-) -> LeRobotDataset:
-    """A small LeRobot dataset of random point clouds, states and actions."""
-    rng = np.random.default_rng(0)
-    features = features or {
-        OBS_POINT_CLOUD: {"dtype": "float32", "shape": (N_POINTS, 3), "names": ["point", "xyz"]},
-        "observation.state": {"dtype": "float32", "shape": (N_STATES,), "names": None},
-        "action": {"dtype": "float32", "shape": (N_ACTIONS,), "names": None},
-    }
-    dataset = LeRobotDataset.create("test/random", fps=80, features=features, root=root, use_videos=False)
-    for episode in range(n_episodes):
-        for _ in range(length + episode):
-            frame = {
-                key: rng.normal(size=feature["shape"]).astype(feature["dtype"])
-                for key, feature in features.items()
-                if feature["dtype"] == "float32"
-            }
-            if point_cloud is not None:
-                frame[OBS_POINT_CLOUD] = point_cloud
-            dataset.add_frame({**frame, "task": f"task {episode % 2}"})
-        dataset.save_episode()
-    dataset.finalize()
-    return LeRobotDataset("test/random", root=root)
-
-
 @pytest.fixture(scope="session")
 def dataset_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a small dataset with episodes of different lengths and two tasks."""
     root = tmp_path_factory.mktemp("data") / "random"
     write_dataset(root)
     return root
-
-
-def overfit(policy: PointCloudPolicy, n_steps: int) -> float:
-    """Train on one small batch; the error of the actions made for it, as a share of what it was."""
-    batch = make_batch(policy.config, batch_size=4)
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=2e-3)
-
-    def error() -> float:
-        policy.eval()
-        chunk = policy.predict_action_chunk(batch)
-        policy.train()
-        return (chunk - batch["action"][:, policy.config.executed]).abs().mean().item()
-
-    before = error()
-    repeated = {key: value.repeat(8, *[1] * (value.ndim - 1)) for key, value in batch.items()}
-    for _ in range(n_steps):
-        loss, _ = policy.forward(repeated)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        policy.update()
-    return error() / before

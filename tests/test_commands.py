@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.features import OBS_POINT_CLOUD
-from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, TINY_UNET, write_dataset
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, TINY_UNET, write_dataset
 
 BIN = Path(sys.executable).parent
 ENVIRONMENT = ["--env.type=metaworld_pointcloud", "--env.task=drawer-close", f"--env.n_points={N_POINTS}"]

@@ -8,7 +8,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot_uca.data.collect import CollectConfig, collect
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
-from tests.conftest import make_config
+from tests.builders import make_config
 from tests.fake_hub import running_hub
 
 

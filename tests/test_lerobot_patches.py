@@ -21,7 +21,7 @@ from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
-from tests.conftest import N_ACTIONS, N_POINTS, N_STATES
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES
 
 
 def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:

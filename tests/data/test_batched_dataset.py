@@ -7,7 +7,7 @@ import pytest
 import torch
 from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tests.conftest import N_ACTIONS, write_dataset
+from tests.builders import N_ACTIONS, write_dataset
 from torch.utils.data import DataLoader, Subset, default_collate
 
 from lerobot_uca.data import batched_dataset

@@ -11,7 +11,7 @@ import onnxruntime
 import pytest
 import torch
 from lerobot.policies import make_policy_config, make_pre_post_processors
-from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_config
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
 
 from lerobot_uca.deploy import onnx_runner
 from lerobot_uca.deploy.export import export

@@ -5,7 +5,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from tests.conftest import N_ACTIONS, SMALL_POLICIES, make_batch, make_observation, make_settings, overfit
+from tests.builders import N_ACTIONS, SMALL_POLICIES, make_batch, make_observation, make_settings, overfit
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.modeling_base import PointCloudPolicy

@@ -11,7 +11,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from tests.conftest import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config, make_observation, overfit
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config, make_observation, overfit
 from torch import nn
 
 from lerobot_uca.errors import UserError
