@@ -6,7 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_uca.point_clouds.cameras import BACKGROUND, Marker, PictureCamera, PointCloudCamera, shade, surface_colours
+from lerobot_uca.point_clouds.cameras import (
+    BACKGROUND,
+    DepthCamera,
+    Marker,
+    PictureCamera,
+    PointCloudCamera,
+    shade,
+    surface_colours,
+)
+from lerobot_uca.point_clouds.depth import DepthToCloud, DepthView, to_millimetres
 from lerobot_uca.point_clouds.geometry import Camera, Crop
 
 SCENE = """
@@ -97,6 +106,30 @@ def test_markers_are_seen_and_hidden_like_solid_spheres(scene):
     moved = np.abs(changed - plain).max(axis=1) > 0
     assert moved.any()
     np.testing.assert_allclose(np.linalg.norm(changed[moved] - above.centre, axis=1), 0.1, atol=1e-9)
+
+
+def test_a_depth_picture_holds_the_points_that_the_cloud_camera_sees(scene):
+    model, data = scene
+    marker = Marker(np.array([-0.6, 0, 0.2]), 0.15, np.array([0, 1.0, 0]))
+    crop = Crop((-0.9, -0.5, 0.02), (0.8, 0.5, 0.9))
+    depth = DepthCamera(CAMERA).capture(model, data, [marker])
+    assert depth.shape == (40, 40)
+    assert depth.min() == pytest.approx(2 - 0.7, abs=0.005)  # the top of the ball
+    expected = PointCloudCamera(CAMERA, crop).capture(model, data, [marker])
+    assert len(expected) > 100
+    make = DepthToCloud([DepthView(CAMERA)], crop, 16)
+    np.testing.assert_allclose(make.points([depth]), expected, atol=1e-6)
+    # In whole millimetres a point moves by half of one along its ray's depth, and none crosses the crop's faces here.
+    in_millimetres = make.points([to_millimetres(depth)])
+    bound = 0.0005 * np.linalg.norm(CAMERA.depth_rays(), axis=1).max() + 1e-6
+    assert np.linalg.norm(in_millimetres - expected, axis=1).max() <= bound
+
+
+def test_a_depth_picture_of_nothing(scene):
+    looking_up = Camera.from_fovy("up", (0.0, 0.0, 2.0), ((1.0, 0, 0), (0, -1.0, 0), (0, 0, -1.0)), 60.0, (8, 8))
+    depth = DepthCamera(looking_up).capture(*scene)
+    assert np.isinf(depth).all()
+    assert (to_millimetres(depth) == 0).all()
 
 
 def test_a_picture_shows_surfaces_in_their_colours(scene):

@@ -47,13 +47,22 @@ class PointCloudCamera:
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
         """Visible points inside the crop, (N, 3), world frame [m]. `data` must be up to date (`mj_forward`)."""
         caster = self._caster
-        distance = caster.cast(model, data).distance
-        for marker in markers:
-            to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)
-            np.minimum(distance, to_marker, out=distance)
+        distance = _distances(caster, model, data, markers)
         near = (distance >= self._enter) & (distance <= self._leave)
         points = caster.origin + caster.directions[near] * distance[near, None]
         return points[self.crop.contains(points)]
+
+
+class DepthCamera:
+    """Sees the scene as a depth camera does: the depth of each pixel along the camera's z axis, without noise."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self._caster = RayCaster(camera.position, camera.ray_directions(), with_normals=False)
+
+    def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
+        """Depths (H, W) [m], inf where nothing is. `to_millimetres` makes of them what a RealSense camera gives."""
+        return self.camera.depth(_distances(self._caster, model, data, markers))
 
 
 class PictureCamera:
@@ -78,6 +87,15 @@ class PictureCamera:
         picture = shade(colour, normal, caster.directions)
         picture[np.isinf(distance)] = BACKGROUND
         return picture.reshape(self.camera.height, self.camera.width, 3)
+
+
+def _distances(caster: RayCaster, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker]) -> Array:
+    """How far the nearest surface or marker is along each ray, (R,) [m]."""
+    distance = caster.cast(model, data).distance
+    for marker in markers:
+        to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)
+        np.minimum(distance, to_marker, out=distance)
+    return distance
 
 
 def shade(colours: Array, normals: Array, directions: Array) -> NDArray[np.uint8]:

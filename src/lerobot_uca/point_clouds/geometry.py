@@ -7,7 +7,7 @@ Letters: N points, R = H * W rays in row-major order from the top left pixel.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import fpsample
 import numpy as np
@@ -91,8 +91,12 @@ class Camera:
 
     def ray_directions(self) -> Array:
         """Unit vectors through the pixel centres, (R, 3), world frame."""
-        rays = self._rays_at_unit_depth() @ np.asarray(self.X_world_camera)[:3, :3].T
+        rays = self.depth_rays()
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def depth_rays(self) -> Array:
+        """Vectors through the pixel centres along which a distance is a depth, (R, 3), world frame."""
+        return self._rays_at_unit_depth() @ np.asarray(self.X_world_camera)[:3, :3].T
 
     def unproject(self, depth: Array) -> Array:
         """Points seen at a depth (H, W), measured along the camera's z axis [m]: (R, 3), world frame [m]."""
@@ -153,7 +157,7 @@ def ray_sphere_distances(origin: Array, directions: Array, centre: Array, radius
     return np.where(hit, along - np.sqrt(np.maximum(half_chord_squared, 0)), np.inf)
 
 
-def sample_farthest(points: Array, n_points: int) -> NDArray[np.float32]:
+def sample_farthest(points: NDArray[np.floating[Any]], n_points: int) -> NDArray[np.float32]:
     """Farthest point sampling of points (N, 3), exact: (n_points, 3) float32 in sampling order.
 
     Every prefix of the result is itself a farthest point sampling, so a policy may take the first 128 of 512.
