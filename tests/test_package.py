@@ -18,13 +18,13 @@ ALLOWED = {
     "objectives": {"meanflow", "networks"},
     "policies": {"meanflow", "objectives", "networks", "inference", "point_clouds", "errors", "features", "registry"},
     "envs": {"point_clouds", "errors", "features", "registry"},
-    "data": {"envs", "point_clouds", "errors", "features"},
-    "robots": {"point_clouds", "errors", "features", "registry"},
+    "data": {"envs", "point_clouds", "errors", "features", "processes"},
+    "robots": {"point_clouds", "errors", "features", "registry", "processes"},
     "visual": {"policies", "data", "envs", "point_clouds", "errors", "features"},
     "deploy": {"policies", "inference", "errors", "features"},
-    "protocol": {"policies", "data", "envs", "errors", "features"},
-    "lerobot_patches": {"data", "policies", "errors", "features"},
-    "commands": {"data", "deploy", "protocol", "robots", "visual", "errors"},
+    "protocol": {"policies", "data", "envs", "errors", "features", "processes"},
+    "lerobot_patches": {"data", "policies", "errors", "features", "processes"},
+    "commands": {"data", "deploy", "protocol", "robots", "visual", "errors", "processes"},
 }
 
 

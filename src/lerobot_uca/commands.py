@@ -2,9 +2,12 @@
 
 import sys
 
+from lerobot_uca.processes import end_by_signals
+
 
 def collect() -> None:
     """`lerobot-uca-collect`."""
+    end_by_signals()
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from lerobot_uca.data.collect import run
@@ -22,6 +25,7 @@ def collect() -> None:
 
 def export() -> None:
     """`lerobot-uca-export`."""
+    end_by_signals()
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from lerobot_uca.deploy.export import run

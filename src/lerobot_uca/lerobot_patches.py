@@ -21,6 +21,7 @@ from lerobot.datasets import factory
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.processes import end_by_signals
 
 SUPPORTED_LEROBOT = "0.6.1"
 SWITCH = "LEROBOT_UCA_BATCHED_READING"
@@ -31,6 +32,8 @@ logger = logging.getLogger(__name__)
 def install() -> None:
     """Apply all patches. A second call changes nothing."""
     report_user_errors()
+    if Path(sys.argv[0]).stem.startswith("lerobot"):  # one of LeRobot's commands, not somebody's own program
+        end_by_signals()
     shorten_decoder_warning()
     if lerobot.__version__ == SUPPORTED_LEROBOT:
         check_output_folders()

@@ -62,7 +62,7 @@ def test_nothing_but_the_dataset_is_left(collected):
 def test_an_existing_folder_is_kept_unless_overwritten(collected, tmp_path):
     root = tmp_path / "drawer"
     shutil.copytree(collected.root, root)
-    with pytest.raises(UserError, match=re.escape(f"'{root}' exists. Choose another --root, or replace it")):
+    with pytest.raises(UserError, match=re.escape(f"'{root}' exists. Choose another folder, or replace it")):
         collect(config(root))
     assert collect(config(root, overwrite=True)).num_frames == 200
 
@@ -86,12 +86,6 @@ def test_a_run_that_dies_leaves_nothing(tmp_path):
         collect(config(tmp_path / "drawer", n_episodes=2))
     gc.collect()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_a_killed_run_could_not_remove_is_hidden_and_replaced(tmp_path):
-    (tmp_path / ".drawer.unfinished" / "meta").mkdir(parents=True)
-    collect(config(tmp_path / "drawer"))
-    assert [path.name for path in tmp_path.iterdir()] == ["drawer"]
 
 
 @pytest.mark.usefixtures("killed_while_writing")
@@ -128,14 +122,6 @@ def test_groups_that_overlap_give_each_task_once(tmp_path):
     env = MetaworldPointCloudConfig(task="hard,assembly,push,dial-turn", n_points=16)
     attempts = collecting._attempts(config(tmp_path / "x", env=env), env)
     assert list(attempts) == [*env.tasks()["hard"], "dial-turn"]
-
-
-def test_an_overwrite_that_cannot_finish_brings_the_old_folder_back(tmp_path, monkeypatch):
-    old, new = tmp_path / "data", tmp_path / "new"
-    old.mkdir()
-    with pytest.raises(FileNotFoundError):
-        collecting._replace(old, new, backup=tmp_path / "backup")  # there is no new folder
-    assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
 def test_a_name_that_is_too_long(tmp_path):

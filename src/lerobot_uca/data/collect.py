@@ -4,8 +4,8 @@ Example:
     lerobot-uca-collect --env.type=metaworld_pointcloud --env.task=dial-turn --repo_id=local/dial-turn
 """
 
-import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -22,6 +22,7 @@ from lerobot.utils.utils import SuppressProgressBars
 from tqdm import tqdm
 
 from lerobot_uca.data.demonstrations import demonstrations
+from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.errors import UserError
@@ -68,10 +69,10 @@ class CollectConfig:
 def collect(config: CollectConfig) -> LeRobotDataset:
     """Collect, write and, if asked for, upload a dataset.
 
-    The dataset is written beside its folder and moved there when it is complete: a killed run leaves no folder.
+    The dataset is written whole or not at all, see `whole_folder`.
 
     Raises:
-        UserError: if the folder exists, cannot be written, or the expert fails too often.
+        UserError: if the folder exists, is being written, cannot be written, or the expert fails too often.
     """
     env_config = config.env
     if not isinstance(env_config, PointCloudEnvConfig):
@@ -85,18 +86,8 @@ def collect(config: CollectConfig) -> LeRobotDataset:
     env_config.validate()
     attempts = _attempts(config, env_config)  # before anything is written: there may be no such expert
     root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
-    unfinished, replaced = (root.with_name(f".{root.name}.{state}") for state in ("unfinished", "replaced"))
-    try:
-        if root.exists() and not config.overwrite:
-            raise UserError(f"'{root}' exists. Choose another --root, or replace it with --overwrite.")
-        root.parent.mkdir(parents=True, exist_ok=True)
-        _remove(unfinished)
+    with whole_folder(root, overwrite=config.overwrite) as unfinished:
         _write(config, env_config, attempts, unfinished)
-        _replace(root, unfinished, backup=replaced)
-    except OSError as error:
-        raise UserError(f"Cannot write '{root}': {error}") from error
-    finally:
-        _remove(unfinished)
     dataset = LeRobotDataset(config.repo_id, root=root)
     if config.push_to_hub:
         try:
@@ -105,24 +96,6 @@ def collect(config: CollectConfig) -> LeRobotDataset:
             reason = " ".join(str(error).split())
             raise UserError(f"The dataset in '{root}' is complete but could not be uploaded: {reason}") from error
     return dataset
-
-
-def _replace(folder: Path, new: Path, *, backup: Path) -> None:
-    if not folder.exists():
-        new.rename(folder)
-        return
-    _remove(backup)
-    folder.rename(backup)
-    try:
-        new.rename(folder)
-    except OSError:
-        backup.rename(folder)
-        raise
-    _remove(backup)
-
-
-def _remove(folder: Path) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _attempts(config: CollectConfig, env_config: PointCloudEnvConfig) -> dict[str, Iterator[Attempt]]:
@@ -151,7 +124,8 @@ def _collect_task(
     attempts = islice(attempts, MAX_ATTEMPTS * n_episodes)
     episodes = demonstrations(env_config.env_factory(task), attempts, n_wanted=n_episodes)
     n_tried = 0
-    with tqdm(total=n_episodes, desc=f"Demonstrations of {task}", unit="episode") as progress:
+    bar = tqdm(total=n_episodes, desc=f"Demonstrations of {task}", unit="episode")
+    with closing(episodes), bar as progress:
         for n_tried, episode in enumerate(episodes, start=1):
             if episode.is_successful:
                 for point_cloud, state, action in zip(*episode[:3], strict=True):

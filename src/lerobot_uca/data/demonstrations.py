@@ -3,8 +3,9 @@
 import multiprocessing
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
+from lerobot_uca.errors import UserError
+from lerobot_uca.processes import end_with_parent
 
 
 class Demonstration(NamedTuple):
@@ -44,13 +47,16 @@ def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> D
 
 def demonstrations(
     env_factory: Callable[[], PointCloudEnv], attempts: Iterator[Attempt], *, n_wanted: int
-) -> Iterator[Demonstration]:
+) -> Generator[Demonstration]:
     """Episodes of the attempts in their order, until n_wanted of them were successful or there are no more.
 
     They are made by one process a core.
     """
     n_workers = os.cpu_count() or 1
-    with ProcessPoolExecutor(n_workers, mp_context=multiprocessing.get_context("forkserver")) as pool:
+    pool = ProcessPoolExecutor(
+        n_workers, mp_context=multiprocessing.get_context("forkserver"), initializer=end_with_parent
+    )
+    try:
         pending: deque[Future[Demonstration]] = deque()
         n_missing = n_wanted
         while n_missing:
@@ -62,3 +68,7 @@ def demonstrations(
             episode = pending.popleft().result()
             n_missing -= episode.is_successful
             yield episode
+    except BrokenProcessPool as error:
+        raise UserError("A process that ran an expert was ended from outside; was there too little memory?") from error
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -1,0 +1,78 @@
+"""Commands end by signals in one line, and their workers end with them, whatever ended them."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from multiprocessing.connection import Listener, wait
+from pathlib import Path
+
+import pytest
+
+COMMAND = """
+import sys, time
+from lerobot_uca.processes import end_by_signals
+end_by_signals()
+try:
+    print("started", flush=True)
+    time.sleep(60)
+finally:
+    print("cleaned up", flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "line"),
+    [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "ended by SIGTERM"), (signal.SIGHUP, "ended by SIGHUP")],
+)
+def test_a_command_ends_in_one_line(number, line):
+    process = subprocess.Popen([sys.executable, "-c", COMMAND], stdout=-1, stderr=-1, text=True)
+    assert process.stdout.readline() == "started\n"
+    process.send_signal(number)
+    out, err = process.communicate()
+    assert (process.returncode, out, err.strip()) == (128 + number, "cleaned up\n", line)
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    code = (
+        "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "from lerobot_uca.processes import end_by_signals; end_by_signals()\n"
+        "assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def pool_of_workers(address: str) -> None:
+    """A parent with two idle workers, each of which holds a connection to the test as long as it lives."""
+    from concurrent.futures import ProcessPoolExecutor
+
+    from lerobot_uca.processes import end_with_parent
+
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(2, mp_context=context, initializer=end_with_parent) as pool:
+        list(pool.map(connect, [address] * 2))
+        signal.pause()
+
+
+def connect(address: str) -> None:
+    from multiprocessing.connection import Client
+
+    connect.connection = Client(address)
+    connect.connection.send(os.getpid())
+
+
+def test_workers_end_with_their_parent_also_by_kill(tmp_path):
+    address = str(tmp_path / "socket")
+    with Listener(address) as listener:
+        code = f"from tests.test_processes import pool_of_workers; pool_of_workers({address!r})"
+        parent = subprocess.Popen([sys.executable, "-c", code], cwd=Path(__file__).parents[1])
+        connections = [listener.accept() for _ in range(2)]
+        for connection in connections:
+            connection.recv()
+        parent.kill()
+        parent.wait()
+        for connection in connections:  # closed by the system when the worker has ended
+            assert wait([connection], timeout=30)
+            with pytest.raises(EOFError):
+                connection.recv()
