@@ -1,0 +1,1 @@
+"""A simulated e-Series controller: the driver does not know the difference."""
