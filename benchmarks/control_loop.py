@@ -69,7 +69,7 @@ def measure(task: str, sizes: dict[str, Any], n_steps: int) -> dict[str, list[fl
     stages: dict[str, list[float]] = {name: [] for name in names}
     for _ in range(n_steps + policy.config.n_action_steps):
         action = expert(env)
-        plans = not policy._planned
+        plans = not policy._action_queue
         simulate, (env.expert_observation, *_) = timed(simulator.step, action)
         capture, points = timed(camera.capture, simulator.model, simulator.data, env._markers())
         sample, cloud = timed(sample_farthest, points, N_POINTS)

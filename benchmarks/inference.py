@@ -96,7 +96,7 @@ def measure(policy: UCAFlowPolicy, batch_size: int, n_calls: int, peak: float, b
 
     generate = make_backend(config.inference)(generate_one)
     milliseconds = (
-        times(lambda: policy._encode_frame(encoder, *frame), n_calls, device),
+        times(lambda: policy._encode_frames(encoder, *frame), n_calls, device),
         times(lambda: generate(generator, noise, o), n_calls, device),
         times(lambda: policy.predict_action_chunk(observation), n_calls, device),
     )

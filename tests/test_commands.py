@@ -206,7 +206,9 @@ def test_a_dataset_with_nan_points(tmp_path):
 
 def test_a_horizon_that_is_too_short(dataset_root, tmp_path):
     line = fail(*train(dataset_root, tmp_path / "train", "--policy.horizon=3"))
-    assert line.startswith("error: policy.horizon must be at least n_obs_steps + n_action_steps - 1 = 4, got 3")
+    assert line.startswith(
+        "error: policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = 4, got 3"
+    )
 
 
 def test_training_into_a_folder_that_cannot_be_written(dataset_root, tmp_path):

@@ -67,6 +67,8 @@ def actions_of_lerobots_loop(policy: UCAFlowPolicy, folder: Path, observations: 
     [
         {},
         {"n_points": 10, "n_obs_steps": 3, "horizon": 6, "n_action_steps": 2},
+        {"obs_stride": 2, "horizon": 16},
+        {"n_obs_steps": 3, "obs_stride": 3, "horizon": 8, "n_action_steps": 2},
         {"normalization_mapping": {"STATE": "MEAN_STD", "ACTION": "IDENTITY"}},
     ],
 )

@@ -148,7 +148,7 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
         ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be one of eager, openvino, "),
         ("flowpolicy", {"delta": 0.0}, "policy.delta must be between 0 and 1, got 0.0"),
         ("flowpolicy", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),
-        ("mp1", {"horizon": 3}, "policy.horizon must be at least n_obs_steps"),
+        ("mp1", {"horizon": 3}, r"policy.horizon must be at least \(n_obs_steps - 1\) \* obs_stride"),
     ],
 )
 def test_wrong_settings(name, changes, message):

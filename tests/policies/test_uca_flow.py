@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import json
 import os
 import re
 import shutil
@@ -42,13 +43,25 @@ def test_lerobot_finds_config_policy_and_processors():
     }
 
 
-def test_horizon_table():
-    """The table in PointCloudPolicyConfig's docstring."""
-    config = make_config()
-    assert config.observation_delta_indices == [-1, 0]
-    assert config.action_delta_indices == [-1, 0, 1, 2]
+@pytest.mark.parametrize(
+    ("stride", "horizon", "observed", "predicted", "entries"),
+    [(1, 4, [-1, 0], [-1, 0, 1, 2], (1, 4)), (2, 5, [-2, 0], [-2, -1, 0, 1, 2], (2, 5))],
+)
+def test_horizon_table(stride, horizon, observed, predicted, entries):
+    """The tables in PointCloudPolicyConfig's docstring."""
+    config = make_config(obs_stride=stride, horizon=horizon)
+    assert config.observation_delta_indices == observed
+    assert config.action_delta_indices == predicted
     assert config.action_delta_indices[config.executed] == [0, 1, 2]
-    assert (config.executed.start, config.executed.stop) == (1, 4)
+    assert (config.executed.start, config.executed.stop) == entries
+
+
+def test_checkpoints_from_before_the_observation_stride_have_stride_1(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["obs_stride"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    assert UCAFlowPolicy.from_pretrained(tmp_path).config.obs_stride == 1
 
 
 @pytest.mark.parametrize(("n_obs_steps", "horizon", "n_action_steps"), [(1, 3, 3), (3, 16, 8), (2, 16, 15)])
@@ -348,8 +361,10 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"horizon": 3}, "policy.horizon must be at least n_obs_steps + n_action_steps - 1 = 4, got 3"),
+        ({"horizon": 3}, "policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = 4, got 3"),
         ({"n_action_steps": 0}, "policy.n_action_steps must be at least 1, got 0"),
+        ({"obs_stride": 0}, "policy.obs_stride must be at least 1, got 0"),
+        ({"obs_stride": 2}, "policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = 5"),
         ({"n_points": 0}, "policy.n_points must be at least 1 or null (all points), got 0"),
         ({"dtype": "float16"}, "policy.dtype must be float32 or bfloat16, got 'float16'"),
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),

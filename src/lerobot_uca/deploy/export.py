@@ -53,7 +53,7 @@ class RawPolicy:
             raise UserError(
                 f"Only this package's point-cloud policies can be exported; '{checkpoint}' is of type '{config.type}'."
             )
-        config.device = "cpu"
+        config.device, config.inference = "cpu", "eager"  # PyTorch itself is what a trace is made of
         self.policy: PointCloudPolicy = get_policy_class(config.type).from_pretrained(folder, config=config)
         self._pre, self._post = make_pre_post_processors(
             config,
@@ -70,18 +70,25 @@ class RawPolicy:
 
     @property
     def input_shapes(self) -> dict[str, tuple[int, ...]]:
-        """What `act` takes, for each input."""
+        """The shapes of `act`'s inputs, by name."""
         config = self.policy.config
         assert config.input_features is not None
+        n_steps = config.obs_span + 1
         return {
-            "point_cloud": (config.n_obs_steps, *config.input_features[OBS_POINT_CLOUD].shape),
-            "state": (config.n_obs_steps, config.n_states),
+            "point_cloud": (n_steps, *config.input_features[OBS_POINT_CLOUD].shape),
+            "state": (n_steps, config.n_states),
             "noise": (config.horizon, config.n_actions),
         }
 
     def act(self, policy: PointCloudPolicy, point_cloud: Tensor, state: Tensor, noise: Tensor) -> Tensor:
-        """Point clouds (O, N, 3) and states (O, S), oldest first, and noise (T, A) to actions (n_action_steps, A)."""
-        batch = self._pre({OBS_POINT_CLOUD: point_cloud[None], OBS_STATE: state[None]})
+        """Actions (n_action_steps, A) from the latest steps and noise (T, A).
+
+        Args:
+            point_cloud, state: (K, N, 3) and (K, S), oldest first; all K steps from the first observed one to the
+                current one, so that a runner needs to know nothing of the observation stride.
+        """
+        stride = policy.config.obs_stride
+        batch = self._pre({OBS_POINT_CLOUD: point_cloud[None, ::stride], OBS_STATE: state[None, ::stride]})
         return self._post(policy.predict_action_chunk(batch, noise=noise[None]))[0]
 
 

@@ -4,7 +4,8 @@
     while True:
         robot.move(policy.select_action(point_cloud, state))
 
-Letters: O observation steps, N points, S state dimensions, T horizon, A action dimensions.
+Letters: K steps from the first observed one to the current one, N points, S state dimensions, T horizon, A action
+dimensions.
 """
 
 from collections import deque
@@ -39,7 +40,7 @@ class OnnxPolicy:
         shapes = {tensor.name: tuple(tensor.shape) for tensor in self._session.get_inputs()}
         if set(shapes) != set(INPUTS):
             raise ValueError(f"'{path}' must have the inputs {', '.join(INPUTS)}, got {', '.join(shapes)}.")
-        self.n_obs_steps, *self._cloud_shape = shapes["point_cloud"]
+        self._n_steps, *self._cloud_shape = shapes["point_cloud"]
         self._state_shape = shapes["state"][1:]
         self._noise_shape = shapes["noise"]
         self._random = np.random.default_rng(seed)
@@ -47,8 +48,8 @@ class OnnxPolicy:
 
     def reset(self) -> None:
         """Forget observations and planned actions: an episode begins."""
-        self._history: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=self.n_obs_steps)
-        self._planned: deque[np.ndarray] = deque()
+        self._history: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=self._n_steps)
+        self._action_queue: deque[np.ndarray] = deque()
 
     def select_action(self, point_cloud: np.ndarray, state: np.ndarray) -> np.ndarray:
         """The next action (A,), from the newest point cloud (N, 3) and state (S,). Call it once every step."""
@@ -56,18 +57,18 @@ class OnnxPolicy:
             _checked("point_cloud", point_cloud, self._cloud_shape),
             _checked("state", state, self._state_shape),
         )
-        self._history.extend([frame] * (1 if self._history else self.n_obs_steps))
-        if not self._planned:
+        self._history.extend([frame] * (1 if self._history else self._n_steps))
+        if not self._action_queue:
             clouds, states = zip(*self._history, strict=True)
-            self._planned.extend(self.plan(np.stack(clouds), np.stack(states)))
-        return self._planned.popleft()
+            self._action_queue.extend(self.plan(np.stack(clouds), np.stack(states)))
+        return self._action_queue.popleft()
 
     def plan(self, point_clouds: np.ndarray, states: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
-        """Actions (n_action_steps, A), to be executed from now on, from a history, oldest first.
+        """Actions (n_action_steps, A), to be executed from now on, from the latest steps, oldest first.
 
         Args:
-            point_clouds: (O, N, 3) float32.
-            states: (O, S) float32.
+            point_clouds: (K, N, 3) float32.
+            states: (K, S) float32.
             noise: (T, A) float32, Gaussian; drawn if not given.
         """
         if noise is None:

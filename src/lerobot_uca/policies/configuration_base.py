@@ -19,13 +19,22 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     Which steps are observed, predicted and executed, for the default values (0 is the current step):
 
         | step        | -1  |  0  |  1  |  2  |
-        | observed    | yes | yes |     |     |   n_obs_steps = 2
+        | observed    | yes | yes |     |     |   n_obs_steps = 2, obs_stride = 1
         | predicted   | yes | yes | yes | yes |   horizon = 4
         | executed    |     | yes | yes | yes |   n_action_steps = 3, entries [1:4] of the prediction
+
+    and with every second step observed (the paper's real robot: stride 2, horizon 16):
+
+        | step        | -2  | -1  |  0  |  1  |  2  |
+        | observed    | yes |     | yes |     |     |   n_obs_steps = 2, obs_stride = 2
+        | predicted   | yes | yes | yes | yes | yes |   horizon = 5
+        | executed    |     |     | yes | yes | yes |   n_action_steps = 3, entries [2:5] of the prediction
     """
 
     # Observation steps O, the current one included.
     n_obs_steps: int = 2
+    # Steps from one observation step to the next. An action is predicted for each step, also between them.
+    obs_stride: int = 1
     # Predicted actions T, from the first observation step on.
     horizon: int = 4
     # Actions executed before the next prediction, from the current step on.
@@ -73,14 +82,13 @@ class PointCloudPolicyConfig(PreTrainedConfig):
 
     def validate_sizes(self) -> None:
         """Raise a `UserError` for values that do not fit together."""
-        for name in ("n_obs_steps", "horizon", "n_action_steps"):
+        for name in ("n_obs_steps", "obs_stride", "horizon", "n_action_steps"):
             if getattr(self, name) < 1:
                 raise UserError(f"policy.{name} must be at least 1, got {getattr(self, name)}.")
-        if self.horizon < self.n_obs_steps + self.n_action_steps - 1:
+        if self.horizon < self.executed.stop:
             raise UserError(
-                f"policy.horizon must be at least n_obs_steps + n_action_steps - 1 = "
-                f"{self.n_obs_steps + self.n_action_steps - 1}, got {self.horizon}: the actions to execute would not "
-                "all be predicted."
+                f"policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = "
+                f"{self.executed.stop}, got {self.horizon}: the actions to execute would not all be predicted."
             )
         if self.n_points is not None and self.n_points < 1:
             raise UserError(f"policy.n_points must be at least 1 or null (all points), got {self.n_points}.")
@@ -137,19 +145,24 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         return self.n_point_features + self.n_state_features
 
     @property
+    def obs_span(self) -> int:
+        """Steps from the first observed one, where the prediction begins, to the current one."""
+        return (self.n_obs_steps - 1) * self.obs_stride
+
+    @property
     def executed(self) -> slice:
         """Which entries of a prediction are executed."""
-        return slice(self.n_obs_steps - 1, self.n_obs_steps - 1 + self.n_action_steps)
+        return slice(self.obs_span, self.obs_span + self.n_action_steps)
 
     @property
     def observation_delta_indices(self) -> list[int]:
         """Observed steps, relative to the current one."""
-        return list(range(1 - self.n_obs_steps, 1))
+        return list(range(-self.obs_span, 1, self.obs_stride))
 
     @property
     def action_delta_indices(self) -> list[int]:
         """Predicted steps, relative to the current one."""
-        return list(range(1 - self.n_obs_steps, 1 - self.n_obs_steps + self.horizon))
+        return list(range(-self.obs_span, -self.obs_span + self.horizon))
 
     @property
     def reward_delta_indices(self) -> None:

@@ -10,7 +10,6 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
 from typing import Any, NamedTuple, NoReturn, Self
@@ -27,6 +26,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference.backends import make_backend
 from lerobot_uca.networks.observation_encoder import ObservationEncoder
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.history import Frame, ObservationHistory
 
 OBSERVATION_KEYS = (OBS_POINT_CLOUD, OBS_STATE)
 
@@ -38,15 +38,6 @@ class Model(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.generator = generator
-
-
-@dataclass
-class Frame:
-    """One step's point cloud (B, 1, N, 3), its state (B, 1, S) and, once a plan needs them, its features (B, 1, F)."""
-
-    cloud: Tensor
-    state: Tensor
-    features: Tensor | None = None
 
 
 class MethodLoss(NamedTuple):
@@ -87,7 +78,7 @@ class PointCloudPolicy(PreTrainedPolicy):
         self.ema_model = deepcopy(self.model).requires_grad_(False)
         self.register_buffer("ema_step", torch.zeros((), dtype=torch.long))
         computed = make_backend(config.inference)
-        self._encode_frame = computed(_encode_frame)
+        self._encode_frames = computed(_encode_frames)
         self._plan = computed(self._encode_and_generate)
         self.reset()
 
@@ -148,8 +139,8 @@ class PointCloudPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget observations and planned actions: an episode begins."""
-        self._history: deque[Frame] = deque(maxlen=self.config.n_obs_steps)
-        self._planned: deque[Tensor] = deque()
+        self._history = ObservationHistory(self.config.n_obs_steps, self.config.obs_stride)
+        self._action_queue: deque[Tensor] = deque()
 
     @torch.no_grad()
     def select_action(self, batch: Mapping[str, Tensor], noise: Tensor | None = None) -> Tensor:
@@ -161,11 +152,11 @@ class PointCloudPolicy(PreTrainedPolicy):
             noise: (B, T, A), drawn if not given.
         """
         frame = self._remember(batch)
-        if not self._planned:
-            self._planned.extend(self._plan_from_remembered(noise).unbind(dim=1))
-        elif len(self._planned) < self.config.n_obs_steps:  # the next plan will see this frame
-            self._features(frame)
-        return self._planned.popleft()
+        if not self._action_queue:
+            self._action_queue.extend(self._plan_from_remembered(noise).unbind(dim=1))
+        elif self._history.is_seen_again(len(self._action_queue), self.config.n_action_steps):
+            self._features(frame)  # now, so that the plan itself takes less time
+        return self._action_queue.popleft()
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: Mapping[str, Tensor], noise: Tensor | None = None) -> Tensor:
@@ -173,8 +164,7 @@ class PointCloudPolicy(PreTrainedPolicy):
 
         Args:
             batch: normalised; either the newest observation, (B, N, 3) and (B, S), which is remembered for the
-                next call, or a whole history, (B, O, N, 3) and (B, O, S), which is not. The latter is always computed
-                by PyTorch.
+                next call, or the observed steps, (B, O, N, 3) and (B, O, S), oldest first, which are not.
             noise: (B, T, A), drawn if not given.
         """
         if _get(batch, OBS_POINT_CLOUD).ndim == 3:
@@ -182,9 +172,12 @@ class PointCloudPolicy(PreTrainedPolicy):
             return self._plan_from_remembered(noise)
         self._check_shapes(batch, self.config.n_obs_steps)
         self._check_finite(batch, OBSERVATION_KEYS)
-        model = self.active_model
-        o = self._encode(model, batch)
-        return self._checked(self._generate_executed(model.generator, self._noise_like(o, noise), o))
+        cloud, state = batch[OBS_POINT_CLOUD][..., : self.config.n_points, :], batch[OBS_STATE]
+        earlier: tuple[Tensor, ...] = ()
+        if self.config.n_obs_steps > 1:
+            (features,) = self._encode_frames(self.active_model.encoder, cloud[:, :-1], state[:, :-1])
+            earlier = features.split(1, dim=1)
+        return self._plan_from(Frame(cloud[:, -1:], state[:, -1:]), earlier, noise)
 
     @property
     def active_model(self) -> Model:
@@ -195,28 +188,32 @@ class PointCloudPolicy(PreTrainedPolicy):
         observation = {key: _get(batch, key)[:, None] for key in OBSERVATION_KEYS}
         self._check_shapes(observation, n_obs=1)
         self._check_finite(observation, OBSERVATION_KEYS)
-        if self._history and len(self._history[-1].state) != len(observation[OBS_STATE]):
+        if self._history.batch_size not in (None, len(observation[OBS_STATE])):
             raise UserError(
-                f"The batch must have {len(self._history[-1].state)} samples, as since the last reset(), "
+                f"The batch must have {self._history.batch_size} samples, as since the last reset(), "
                 f"got {len(observation[OBS_STATE])}."
             )
         frame = Frame(observation[OBS_POINT_CLOUD][..., : self.config.n_points, :], observation[OBS_STATE])
-        n_missing = self.config.n_obs_steps if not self._history else 1
-        self._history.extend([frame] * n_missing)
+        self._history.append(frame)
         return frame
 
     def _features(self, frame: Frame) -> Tensor:
         if frame.features is None:
-            (frame.features,) = self._encode_frame(self.active_model.encoder, frame.cloud, frame.state)
+            (frame.features,) = self._encode_frames(self.active_model.encoder, frame.cloud, frame.state)
         return frame.features
 
     def _plan_from_remembered(self, noise: Tensor | None) -> Tensor:
-        *earlier, newest = self._history
-        noise = self._noise_like(newest.state, noise)
-        actions, newest.features = self._plan(
-            self.active_model, newest.cloud, newest.state, noise, *map(self._features, earlier)
-        )
-        return self._checked(actions)
+        *earlier, newest = self._history.observed
+        return self._plan_from(newest, map(self._features, earlier), noise)
+
+    def _plan_from(self, newest: Frame, earlier: Iterable[Tensor], noise: Tensor | None) -> Tensor:
+        if noise is None:
+            size = (len(newest.state), self.config.horizon, self.config.n_actions)
+            noise = torch.randn(size, device=newest.state.device)
+        actions, newest.features = self._plan(self.active_model, newest.cloud, newest.state, noise, *earlier)
+        if not _is_finite(actions):  # a robot must never get them
+            self._raise_diverged()
+        return actions
 
     def _encode_and_generate(
         self, model: Model, cloud: Tensor, state: Tensor, noise: Tensor, *earlier: Tensor
@@ -226,24 +223,12 @@ class PointCloudPolicy(PreTrainedPolicy):
         One function, because between two a CPU loses as much time as a tenth of a small network takes.
         """
         newest = model.encoder(cloud, state)
-        return self._generate_executed(model.generator, noise, torch.cat([*earlier, newest], dim=1)), newest
-
-    def _generate_executed(self, generator: nn.Module, noise: Tensor, o: Tensor) -> Tensor:
-        return self.generate(generator, noise, o)[:, self.config.executed]
+        actions = self.generate(model.generator, noise, torch.cat([*earlier, newest], dim=1))
+        return actions[:, self.config.executed], newest
 
     def _encode(self, model: Model, batch: Mapping[str, Tensor]) -> Tensor:
         cloud = batch[OBS_POINT_CLOUD][..., : self.config.n_points, :]
         return model.encoder(cloud, batch[OBS_STATE])
-
-    def _noise_like(self, values: Tensor, noise: Tensor | None) -> Tensor:
-        if noise is None:
-            noise = torch.randn(len(values), self.config.horizon, self.config.n_actions, device=values.device)
-        return noise
-
-    def _checked(self, actions: Tensor) -> Tensor:
-        if not _is_finite(actions):  # a robot must never get them
-            self._raise_diverged()
-        return actions
 
     # Bad input --------------------------------------------------------------------------------------------------
 
@@ -300,7 +285,7 @@ def _get(batch: Mapping[str, Tensor], key: str) -> Tensor:
     return batch[key]
 
 
-def _encode_frame(encoder: nn.Module, cloud: Tensor, state: Tensor) -> tuple[Tensor]:
+def _encode_frames(encoder: nn.Module, cloud: Tensor, state: Tensor) -> tuple[Tensor]:
     return (encoder(cloud, state),)
 
 
