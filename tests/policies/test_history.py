@@ -4,7 +4,7 @@ import pytest
 import torch
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tests.conftest import N_ACTIONS, make_config, make_observation
+from tests.builders import N_ACTIONS, make_config, make_observation
 
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.history import Frame, ObservationHistory
