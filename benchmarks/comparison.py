@@ -13,9 +13,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from learning import read
+from common import RESULTS as FOLDER
+from common import read_rows
 
-RESULTS = Path(__file__).parent / "results" / "comparison.csv"
+RESULTS = FOLDER / "comparison.csv"
 FIRST_EVAL_SEED = 3_000_000
 STEPS = {"dial-turn": 600, "shelf-place": 1200, "door": 1200}
 ADROIT_TASKS = ("door",)
@@ -66,7 +67,7 @@ def learn(method: str, task: str, seed: int, expert: str | None) -> None:
 
 def print_table() -> None:
     """Success rates [%] by training seed, and the paper's in brackets."""
-    rows = read(RESULTS)
+    rows = read_rows(RESULTS)
     print("| | " + " | ".join(f"{task}, {steps} steps" for task, steps in STEPS.items()) + " |")
     print("|---" * (len(STEPS) + 1) + "|")
     for method, arguments in METHODS.items():

@@ -8,51 +8,45 @@ is encoded). 'preprocess' and 'postprocess' are LeRobot's pipelines, which run i
 """
 
 import argparse
-import csv
-import sys
-import time
-from collections.abc import Callable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from common import CLOUD_POINTS, N_ACTIONS, N_STATES, SIZES, make_policy, timed, write_rows
 from lerobot.envs import preprocess_observation
 from lerobot.policies import make_pre_post_processors
 
-import lerobot_policy_uca_flow  # noqa: F401  (registers policy and environment)
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv, ScriptedExpert
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.geometry import sample_farthest
-from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
-from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 TASKS = ("drawer-close", "dial-turn", "shelf-place", "hand-insert", "hammer")
-CONFIGURATIONS: dict[str, Any] = {"small": {"dim": 128, "n_points": 128}, "full": {}}
-N_POINTS, N_STATES, N_ACTIONS = 512, 9, 4
 
 
 def main() -> None:
     """Print a CSV table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=150, help="steps of the episode to measure")
-    n_steps = parser.parse_args().steps
-    table = csv.writer(sys.stdout, lineterminator="\n")
-    for configuration, sizes in CONFIGURATIONS.items():
-        for task in TASKS:
+    parser.add_argument("--tasks", nargs="+", default=TASKS, choices=TASKS)
+    args = parser.parse_args()
+    write_rows(rows(args.tasks, args.steps))
+
+
+def rows(tasks: Iterable[str], n_steps: int) -> Iterator[dict[str, str]]:
+    """A row for each configuration and task: median milliseconds of the stages."""
+    for configuration, sizes in SIZES.items():
+        for task in tasks:
             stages = measure(task, sizes, n_steps)
-            if (configuration, task) == (next(iter(CONFIGURATIONS)), TASKS[0]):
-                table.writerow(["configuration", "task", *stages])
-            medians = (f"{np.median(milliseconds):.2f}" for milliseconds in stages.values())
-            table.writerow([configuration, task, *medians])
-            sys.stdout.flush()
+            medians = {name: f"{np.median(milliseconds):.2f}" for name, milliseconds in stages.items()}
+            yield {"configuration": configuration, "task": task, **medians}
 
 
 @torch.inference_mode()
 def measure(task: str, sizes: dict[str, Any], n_steps: int) -> dict[str, list[float]]:
     """Times [ms] of each stage; 'step' is a whole one, on average over planning and queued steps."""
-    env, expert = MetaworldPointCloudEnv(task, n_points=N_POINTS), ScriptedExpert(task)
-    policy = make_policy(sizes)
+    env, expert = MetaworldPointCloudEnv(task, n_points=CLOUD_POINTS), ScriptedExpert(task)
+    policy = make_policy(**sizes)
     preprocess, postprocess = make_pre_post_processors(policy.config, dataset_stats=unit_statistics())
     observation, _ = env.reset(seed=0)
     simulator, camera = env._simulator, env._cloud_camera
@@ -72,7 +66,7 @@ def measure(task: str, sizes: dict[str, Any], n_steps: int) -> dict[str, list[fl
         plans = not policy._action_queue
         simulate, (env.expert_observation, *_) = timed(simulator.step, action)
         capture, points = timed(camera.capture, simulator.model, simulator.data, env._markers())
-        sample, cloud = timed(sample_farthest, points, N_POINTS)
+        sample, cloud = timed(sample_farthest, points, CLOUD_POINTS)
         observation = {"point_cloud": cloud[None], "agent_pos": observation["agent_pos"].reshape(1, -1)}
         to_tensors, batch = timed(preprocess_observation, observation)
         pre, batch = timed(preprocess, batch)
@@ -87,30 +81,12 @@ def measure(task: str, sizes: dict[str, Any], n_steps: int) -> dict[str, list[fl
     return {name: milliseconds[1 if name == "plan" else warm_up :] for name, milliseconds in stages.items()}
 
 
-def make_policy(sizes: dict[str, Any]) -> UCAFlowPolicy:
-    """An untrained policy: weights do not change the time."""
-    features = {
-        OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (N_POINTS, 3)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
-    }
-    action = {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))}
-    config = UCAFlowConfig(device="cpu", input_features=features, output_features=action, **sizes)
-    return UCAFlowPolicy(config).eval()
-
-
 def unit_statistics() -> dict[str, dict[str, torch.Tensor]]:
     """Statistics of a dataset that is normalised already."""
     return {
         key: {"min": -torch.ones(size), "max": torch.ones(size)}
         for key, size in ((OBS_POINT_CLOUD, 3), ("observation.state", N_STATES), ("action", N_ACTIONS))
     }
-
-
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Milliseconds a call takes, and its result."""
-    start = time.perf_counter()
-    result = function(*arguments)
-    return 1e3 * (time.perf_counter() - start), result
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from common import print_provenance
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -30,6 +31,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="PNG to draw all clouds into, 40 steps into an expert's episode")
     args = parser.parse_args()
     shares = {task: worst_shares(task, args.seeds) for task in tqdm(task_descriptions(), unit="task")}
+    print_provenance()
     print(f"{f'share inside, worst of {args.seeds} seeds':34}{'positions':>10}{'points of movable objects':>28}")
     for task, (positions, points) in shares.items():
         print(f"{task:34}{positions:10.2f}{points:28.2f}")

@@ -11,12 +11,12 @@ import logging
 from pathlib import Path
 
 import torch
+from common import print_provenance
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from torch import Tensor
 from torch.utils.data import default_collate
 
-import lerobot_policy_uca_flow  # noqa: F401  (registers the policies)
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -47,6 +47,7 @@ def main() -> None:
     error = made - expert[:, config.executed]
     change = expert[:, 1:] - expert[:, :-1]
     executed, moves = ~padded[:, config.executed], ~(padded[:, 1:] | padded[:, :-1])
+    print_provenance()
     print(f"{'episode':>8}{'error':>9}{'median':>9}{'change':>9}{'action':>9}")
     for episode in [*raw["episode_index"].unique().tolist(), "all"]:
         of = torch.ones(len(error), dtype=torch.bool) if episode == "all" else raw["episode_index"] == episode

@@ -13,34 +13,23 @@ single sample is computed in one thread.) The peak is float32's, also beside bfl
 """
 
 import argparse
-import csv
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from common import SIZES, make_observation, make_policy, matrix_product_peak, reading_bandwidth, times, write_rows
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-import lerobot_policy_uca_flow  # noqa: F401  (registers the policy)
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference.backends import BACKENDS, make_backend
-from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
-from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
-N_STATES, N_ACTIONS, CLOUD_POINTS = 9, 4, 512
-SIZES: dict[str, Any] = {"small": {"dim": 128, "n_points": 128}, "full": {"dim": 256, "n_points": 512}}
 RUNTIMES = ["eager", "onnxruntime", "openvino", "openvino_bfloat16"]
 STAGES = ("encode", "generate", "plan")
-COLUMNS = (
-    "configuration",
-    "computed by",
-    "batch",
-    *(f"{stage}{unit}" for stage in STAGES for unit in ("", " / floor")),
-)
+MEASURED = (*(f"{stage}{unit}" for stage in STAGES for unit in ("", " / floor")), "plan p99")
 
 
 def main() -> None:
@@ -51,41 +40,29 @@ def main() -> None:
     parser.add_argument("--computed_by", nargs="+", default=RUNTIMES, choices=BACKENDS)
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
-    peak, bandwidth = matrix_product_peak(args.device), reading_bandwidth(args.device)
+    peak, bandwidth = matrix_product_peak(device=args.device), reading_bandwidth(args.device)
     machine = f"{args.device}, {torch.get_num_threads()} threads, {peak / 1e9:.0f} GFLOP/s, {bandwidth / 1e9:.1f} GB/s"
     print(f"{machine}; times in ms, medians", file=sys.stderr)
-    table = csv.writer(sys.stdout, lineterminator="\n")
-    table.writerow([*COLUMNS, "plan p99"])
-    for size in SIZES:
+    write_rows(rows(args, peak, bandwidth))
+
+
+def rows(args: argparse.Namespace, peak: float, bandwidth: float) -> Iterator[dict[str, Any]]:
+    """A row for each size, batch and backend."""
+    for size, settings in SIZES.items():
         for batch_size in args.batch_sizes:
             for name in args.computed_by:
                 torch._dynamo.reset()  # it compiles a function for so many shapes and no more
-                row = measure(make(size, name, args.device), batch_size, args.calls, peak, bandwidth)
-                table.writerow([size, name, batch_size, *(f"{value:.3f}" for value in row)])
-                sys.stdout.flush()
-
-
-def make(size: str, computed_by: str, device: str = "cpu") -> UCAFlowPolicy:
-    """An untrained policy: weights do not change the time."""
-    features = {
-        OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (CLOUD_POINTS, 3)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
-    }
-    action = {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))}
-    config = UCAFlowConfig(
-        device=device, input_features=features, output_features=action, inference=computed_by, **SIZES[size]
-    )
-    return UCAFlowPolicy(config).to(device).eval()
+                policy = make_policy(inference=name, device=args.device, **settings)
+                numbers = measure(policy, batch_size, args.calls, peak, bandwidth)
+                measured = zip(MEASURED, (f"{number:.3f}" for number in numbers), strict=True)
+                yield {"configuration": size, "computed by": name, "batch": batch_size, **dict(measured)}
 
 
 @torch.inference_mode()
-def measure(policy: UCAFlowPolicy, batch_size: int, n_calls: int, peak: float, bandwidth: float) -> list[float]:
-    """The numbers of a row: COLUMNS from 'encode' on, and plan's 99th percentile."""
+def measure(policy: PointCloudPolicy, batch_size: int, n_calls: int, peak: float, bandwidth: float) -> list[float]:
+    """The numbers of a row, in the order of MEASURED."""
     config, device = policy.config, policy.config.device
-    observation = {
-        OBS_POINT_CLOUD: torch.rand(batch_size, CLOUD_POINTS, 3, device=device),
-        "observation.state": torch.rand(batch_size, N_STATES, device=device),
-    }
+    observation = make_observation(batch_size, device=device)
     frame = (observation[OBS_POINT_CLOUD][:, None, : config.n_points], observation["observation.state"][:, None])
     noise = torch.randn(batch_size, config.horizon, config.n_actions, device=device)
     o = torch.randn(batch_size, config.n_obs_steps, config.n_obs_features, device=device)
@@ -113,18 +90,6 @@ def measure(policy: UCAFlowPolicy, batch_size: int, n_calls: int, peak: float, b
     return [*(number for pair in pairs for number in pair), float(np.percentile(milliseconds[-1], 99))]
 
 
-def times(function: Callable[[], Any], n_calls: int, device: str) -> list[float]:
-    """Milliseconds of each call, after a few to warm up."""
-    milliseconds = []
-    for _ in range(n_calls + 10):
-        start = time.perf_counter()
-        function()
-        if device != "cpu":
-            torch.accelerator.synchronize()
-        milliseconds.append(1e3 * (time.perf_counter() - start))
-    return milliseconds[10:]
-
-
 def flops(function: Callable[[], Any]) -> int:
     """Floating-point operations of a call."""
     with FlopCounterMode(display=False) as counter:
@@ -135,18 +100,6 @@ def flops(function: Callable[[], Any]) -> int:
 def n_bytes(network: nn.Module) -> int:
     """Of the weights."""
     return sum(parameter.nbytes for parameter in network.parameters())
-
-
-def matrix_product_peak(device: str, size: int = 2048) -> float:
-    """The best rate of a square matrix product [FLOP/s]."""
-    a, b = torch.randn(2, size, size, device=device)
-    return 2 * size**3 / (min(times(lambda: a @ b, 10, device)) / 1e3)
-
-
-def reading_bandwidth(device: str, n_megabytes: int = 256) -> float:
-    """The best rate of reading memory [bytes/s]."""
-    data = torch.ones(n_megabytes * 2**18, device=device)
-    return data.nbytes / (min(times(data.sum, 10, device)) / 1e3)
 
 
 if __name__ == "__main__":

@@ -3,119 +3,117 @@
 python benchmarks/latency.py                 # measures, writes benchmarks/results/latency.csv and draws latency.png
 python benchmarks/latency.py --draw_only     # the picture again, from the CSV file
 
-One process, batch 1, Meta-World's shapes (state 9, action 4), without pre- and postprocessing: the newest frame goes
-through the encoder, the one before it is remembered, the network makes the actions. UCA-Flow runs as it does by
-default, in OpenVINO, and in PyTorch, as the baselines do. The policies take turns, so that whatever else the machine
-does meets all of them alike. Each finds its weights driven out of the cache by those before
-it: alone, UCA-Flow is twice as fast (benchmarks/inference.py).
+Each policy is computed by PyTorch and by OpenVINO, so that like compares with like; 'default' says which of the two a
+user gets without asking. One process, batch 1, Meta-World's shapes (state 9, action 4), without pre- and
+postprocessing: the newest frame goes through the encoder, the one before it is remembered, the network makes the
+actions. The policies take turns, so that whatever else the machine does meets all of them alike. Each finds its weights
+driven out of the cache by the others': alone, UCA-Flow is twice as fast (benchmarks/inference.py). 9 GB of memory.
 """
 
 import argparse
-import csv
-import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies import make_policy_config
-from lerobot.policies.factory import get_policy_class
+from common import RESULTS, make_observation, make_policy, read_rows, timed, write_rows
+from tqdm import tqdm
 
-import lerobot_policy_uca_flow  # noqa: F401  (registers the policies)
-from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
-RESULTS = Path(__file__).parent / "results" / "latency.csv"
-POLICIES = {
-    "UCA-Flow": {"policy_type": "uca_flow"},
-    "UCA-Flow (PyTorch)": {"policy_type": "uca_flow", "inference": "eager"},
-    "MP1": {"policy_type": "mp1"},
-    "FlowPolicy": {"policy_type": "flowpolicy"},
-    "Simple DP3": {"policy_type": "simple_dp3"},
-    "DP3": {"policy_type": "dp3"},
-}
-POINTS, THREADS = (512, 1024), (1, 2)
-N_STATES, N_ACTIONS = 9, 4
+POLICIES = {"UCA-Flow": "uca_flow", "MP1": "mp1", "FlowPolicy": "flowpolicy", "Simple DP3": "simple_dp3", "DP3": "dp3"}
+ENGINES = {"PyTorch": "eager", "OpenVINO": "openvino"}
 # ms with one thread and 512 points, measured with the public code of each on two cores with AVX-512.
 PUBLIC_CODE = {"MP1": 112, "FlowPolicy": 115, "Simple DP3": 65, "DP3": 1116}
+REFERENCE = "UCA-Flow"
+
+
+class Entry(NamedTuple):
+    """A policy and what computes it."""
+
+    name: str
+    engine: str
+    policy: PointCloudPolicy
+    is_default: bool
 
 
 def main() -> None:
-    """Print a table, write it and draw it."""
+    """Measure, write and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=RESULTS / "latency.csv", help="CSV file, beside it the picture")
+    parser.add_argument("--policies", nargs="+", default=list(POLICIES), choices=list(POLICIES))
+    parser.add_argument("--points", type=int, nargs="+", default=[512, 1024])
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=20, help="calls of each policy that are measured")
     parser.add_argument("--warm_up", type=int, default=3, help="calls of each policy before those")
     parser.add_argument("--draw_only", action="store_true", help="draw what was measured before")
     args = parser.parse_args()
     if not args.draw_only:
-        rows = measure(args.rounds, args.warm_up)
-        with RESULTS.open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-    draw()
+        rows = list(measure_all(args))
+        with args.output.open("w", newline="") as file:
+            write_rows(rows, file)
+    draw(args.output)
 
 
-def measure(n_rounds: int, n_warm_up: int) -> list[dict[str, str]]:
-    """A row for each policy, number of points and number of threads."""
-    rows = []
-    print(f"{'':20}{'parameters':>13}{'calls':>7}{'points':>8}{'threads':>9}{'median':>9}{'p10':>9}{'p90':>9}", end="")
-    print(f"{'x UCA-Flow':>12}{'x public code':>15}")
-    for n_threads in THREADS:
+def measure_all(args: argparse.Namespace) -> Iterator[dict[str, str]]:
+    """Rows for each number of threads and points."""
+    for n_threads in args.threads:
         torch.set_num_threads(n_threads)
-        policies = {name: make(**settings) for name, settings in POLICIES.items()}  # a trace keeps its threads
-        for n_points in POINTS:
-            observation = {
-                OBS_POINT_CLOUD: torch.rand(1, n_points, 3) * 2 - 1,
-                "observation.state": torch.rand(1, N_STATES) * 2 - 1,
-            }
-            for policy in policies.values():
-                policy.reset()
-            times: dict[str, list[float]] = {name: [] for name in POLICIES}
-            for _ in range(n_warm_up + n_rounds):
-                for name, policy in policies.items():
-                    start = time.perf_counter()
-                    policy.predict_action_chunk(observation)
-                    times[name].append(1e3 * (time.perf_counter() - start))
-            medians = {name: np.median(values[n_warm_up:]) for name, values in times.items()}
-            for name, policy in policies.items():
-                p10, p90 = np.percentile(times[name][n_warm_up:], (10, 90))
-                row = {
-                    "policy": name,
-                    "parameters": str(sum(parameter.numel() for parameter in policy.ema_model.parameters())),
-                    "network_calls": str(count_network_calls(policy)),
-                    "points": str(n_points),
-                    "threads": str(n_threads),
-                    "median_ms": f"{medians[name]:.2f}",
-                    "p10_ms": f"{p10:.2f}",
-                    "p90_ms": f"{p90:.2f}",
-                    "ratio_to_uca_flow": f"{medians[name] / medians['UCA-Flow']:.1f}",
-                }
-                rows.append(row)
-                widths = (20, 13, 7, 8, 9, 9, 9, 9, 12)
-                print("".join(f"{row[key]:>{width}}" for key, width in zip(row, widths, strict=True)), end="")
-                compared = (n_points, n_threads) == (512, 1) and name in PUBLIC_CODE
-                print(f"{medians[name] / PUBLIC_CODE[name]:15.2f}" if compared else "")
-    return rows
+        entries = [entry for name in args.policies for entry in make_entries(name, max(args.points))]
+        for n_points in args.points:
+            times = measure([entry.policy for entry in entries], n_points, args.warm_up, args.rounds)
+            yield from make_rows(entries, times, n_points, n_threads)
 
 
-def make(policy_type: str, **settings: Any) -> PointCloudPolicy:
-    """An untrained policy in eval mode, without the second copy of its weights."""
-    config = make_policy_config(
-        policy_type,
-        **settings,
-        device="cpu",
-        input_features={
-            OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (max(POINTS), 3)),
-            "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))},
-    )
-    policy = get_policy_class(policy_type)(config).eval()
-    policy.model = policy.ema_model
-    return policy
+def make_entries(name: str, cloud_points: int) -> Iterator[Entry]:
+    """A policy, by each engine; all of them share one copy of the weights."""
+    first = make_policy(POLICIES[name], cloud_points)
+    default = first.config.inference
+    for engine, inference in ENGINES.items():
+        policy = make_policy(POLICIES[name], cloud_points, inference=inference)
+        policy.model = policy.ema_model = first.ema_model
+        yield Entry(name, engine, policy, inference == default)
+
+
+def measure(policies: list[PointCloudPolicy], n_points: int, n_warm_up: int, n_rounds: int) -> list[list[float]]:
+    """Milliseconds of each policy's calls, which take turns."""
+    observation = make_observation(cloud_points=n_points)
+    times: list[list[float]] = [[] for _ in policies]
+    for policy in policies:
+        policy.reset()
+    for _ in tqdm(range(n_warm_up + n_rounds), desc=f"{n_points} points", unit="round"):
+        for policy, own in zip(policies, times, strict=True):
+            own.append(timed(policy.predict_action_chunk, observation)[0])
+    return [own[n_warm_up:] for own in times]
+
+
+def make_rows(
+    entries: list[Entry], times: list[list[float]], n_points: int, n_threads: int
+) -> Iterator[dict[str, str]]:
+    """A row for each policy and engine."""
+    medians = [float(np.median(own)) for own in times]
+    reference = {entry.engine: ms for entry, ms in zip(entries, medians, strict=True) if entry.name == REFERENCE}
+    for entry, own, median in zip(entries, times, medians, strict=True):
+        p10, p90 = np.percentile(own, (10, 90))
+        compared = (n_points, n_threads) == (512, 1) and entry.engine == "PyTorch" and entry.name in PUBLIC_CODE
+        row = {
+            "policy": entry.name,
+            "computed_by": entry.engine,
+            "default": "yes" if entry.is_default else "no",
+            "parameters": str(sum(parameter.numel() for parameter in entry.policy.ema_model.parameters())),
+            "network_calls": str(count_network_calls(entry.policy)),
+            "points": str(n_points),
+            "threads": str(n_threads),
+            "median_ms": f"{median:.2f}",
+            "p10_ms": f"{p10:.2f}",
+            "p90_ms": f"{p90:.2f}",
+            "ratio_to_uca_flow_by_the_same": f"{median / reference[entry.engine]:.1f}" if reference else "",
+            "ratio_to_public_code": f"{median / PUBLIC_CODE[entry.name]:.2f}" if compared else "",
+        }
+        print("  ".join(row.values()))
+        yield row
 
 
 def count_network_calls(policy: PointCloudPolicy) -> int:
@@ -130,29 +128,31 @@ def count_network_calls(policy: PointCloudPolicy) -> int:
     return len(calls)
 
 
-def draw() -> None:
-    """Bars of the CSV file's medians, from p10 to p90."""
-    with RESULTS.open() as file:
-        rows = list(csv.DictReader(file))
-    figure, axes = plt.subplots(1, len(THREADS), figsize=(9, 3.2), sharey=True, layout="constrained")
-    for axis, n_threads in zip(axes, THREADS, strict=True):
-        for i, n_points in enumerate(POINTS):
-            bars = [row for row in rows if (row["threads"], row["points"]) == (str(n_threads), str(n_points))]
-            median, p10, p90 = (
-                np.array([float(bar[key]) for bar in bars]) for key in ("median_ms", "p10_ms", "p90_ms")
-            )
-            positions = np.arange(len(bars)) + 0.4 * i
-            axis.bar(positions, median, 0.36, yerr=(median - p10, p90 - median), capsize=2, label=f"{n_points} points")
-            for x, value, top in zip(positions, median, p90, strict=True):
-                label = f"{value:.2g}" if value < 10 else f"{value:.0f}"
-                axis.annotate(label, (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
-        axis.set_xticks(np.arange(len(bars)) + 0.2, [bar["policy"].replace(" ", "\n") for bar in bars], fontsize=8)
-        axis.set_yscale("log")
-        axis.set_title(f"{n_threads} thread{'s' * (n_threads > 1)}", fontsize=10)
-        axis.margins(y=0.12)
-    axes[0].set_ylabel("ms for a chunk of actions")
-    axes[0].legend(fontsize=8, loc="upper left")
-    figure.savefig(RESULTS.with_suffix(".png"), dpi=120)
+def draw(path: Path) -> None:
+    """Bars of a CSV file's medians with its fewest points and threads, from p10 to p90; defaults are hatched."""
+    rows = read_rows(path)
+    fewest = {key: str(min(int(row[key]) for row in rows)) for key in ("points", "threads")}
+    rows = [row for row in rows if fewest.items() <= row.items()]
+    figure, axes = plt.subplots(figsize=(7, 3.4), layout="constrained")
+    names = list(dict.fromkeys(row["policy"] for row in rows))
+    for i, engine in enumerate(ENGINES):
+        bars = [row for row in rows if row["computed_by"] == engine]
+        median, p10, p90 = (np.array([float(bar[key]) for bar in bars]) for key in ("median_ms", "p10_ms", "p90_ms"))
+        positions = np.array([names.index(bar["policy"]) for bar in bars]) + 0.4 * i
+        drawn = axes.bar(positions, median, 0.36, yerr=(median - p10, p90 - median), capsize=2, label=engine)
+        for bar, patch, x, value, top in zip(bars, drawn, positions, median, p90, strict=True):
+            patch.set_hatch("//" if bar["default"] == "yes" else "")
+            label = f"{value:.2g}" if value < 10 else f"{value:.0f}"
+            axes.annotate(label, (x, top), (0, 2), textcoords="offset points", ha="center", fontsize=8)
+    axes.set_xticks(np.arange(len(names)) + 0.2, names)
+    axes.set_yscale("log")
+    axes.margins(y=0.12)
+    axes.set_ylabel("ms for a chunk of actions")
+    axes.set_title(
+        f"{fewest['points']} points, {fewest['threads']} thread; hatched: what a user gets by default", fontsize=10
+    )
+    axes.legend(fontsize=9, loc="upper left", title="computed by", title_fontsize=9)
+    figure.savefig(path.with_suffix(".png"), dpi=110)
 
 
 if __name__ == "__main__":

@@ -18,14 +18,13 @@ import time
 from pathlib import Path
 
 import torch
+from common import PROVENANCE, provenance, read_rows
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env, make_env_pre_post_processors
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from lerobot.utils.random_utils import set_seed
-
-import lerobot_policy_uca_flow  # noqa: F401  (registers policies and environments)
 
 OUTPUT = Path("outputs/learning")
 IDENTITY = ("name", "task", "steps", "training_seed", "first_eval_seed", "episodes", "arguments")
@@ -52,7 +51,7 @@ def main() -> None:
     for seed in args.seeds:
         values = (args.name, args.task, args.steps, seed, args.first_eval_seed, args.n_episodes)
         row = dict(zip(IDENTITY, (*map(str, values), " ".join([args.config, *for_training])), strict=True))
-        if any(row.items() <= known.items() for known in read(args.results)):
+        if any(row.items() <= known.items() for known in read_rows(args.results)):
             print("there:", row)
             continue
         dataset = collect(args.env, args.task, args.expert)
@@ -64,6 +63,7 @@ def main() -> None:
         success = evaluate(checkpoint, env_config, args.n_episodes, args.first_eval_seed)
         minutes = ((trained - start) / 60, (time.monotonic() - trained) / 60)
         row |= dict(zip(MEASURED, (f"{success:.0f}", *(f"{value:.1f}" for value in minutes)), strict=True))
+        row |= provenance()
         add(args.results, row)
         print(row, flush=True)
 
@@ -115,21 +115,13 @@ def run(program: str, *arguments: str) -> None:
         sys.exit(f"error: {program} failed")
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file, none if there is no file."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def add(path: Path, row: dict[str, str]) -> None:
     """Write the rows of a CSV file and one more, whole or not at all."""
     unfinished = path.with_suffix(".unfinished")
     with unfinished.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*IDENTITY, *MEASURED], lineterminator="\n")
+        writer = csv.DictWriter(file, [*IDENTITY, *MEASURED, *PROVENANCE], lineterminator="\n")
         writer.writeheader()
-        writer.writerows([*read(path), row])
+        writer.writerows([*read_rows(path), row])
     unfinished.replace(path)
 
 

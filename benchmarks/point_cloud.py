@@ -4,14 +4,11 @@ python benchmarks/point_cloud.py --expert='../shared/adroit_experts/{task}.npz'
 """
 
 import argparse
-import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
+from common import print_provenance, timed
 from lerobot.envs import make_env_config
 
-import lerobot_policy_uca_flow  # noqa: F401  (registers the environments)
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Expert
 from lerobot_uca.point_clouds.geometry import sample_farthest
@@ -29,6 +26,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=100, help="steps of the episode to measure")
     parser.add_argument("--expert", help="who acts in Adroit, as for lerobot-uca-collect; random actions by default")
     args = parser.parse_args()
+    print_provenance()
     print(f"{'ms, median':34}" + "".join(f"{name:>14}" for name in STAGES))
     for kind, tasks in TASKS.items():
         for task in tasks:
@@ -61,13 +59,6 @@ def measure(config: PointCloudEnvConfig, task: str, expert: Expert, n_steps: int
         picture, _ = timed(env.render)
         rows.append([step, rays, sample, observe, picture, len(points)])
     return np.array(rows)
-
-
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Milliseconds a call takes, and its result."""
-    start = time.perf_counter()
-    result = function(*arguments)
-    return 1e3 * (time.perf_counter() - start), result
 
 
 if __name__ == "__main__":

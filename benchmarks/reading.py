@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import print_provenance
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.utils import SuppressProgressBars
 from torch.utils.data import DataLoader, Dataset
@@ -25,7 +26,8 @@ from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.features import OBS_POINT_CLOUD
 
 FPS, BATCH_SIZE = 80, 128
-SIZES = {"metaworld": (10, 200, 512), "dp3": (40, 400, 1024)}
+SIZES = {"tiny": (2, 200, 32), "metaworld": (10, 200, 512), "dp3": (40, 400, 1024)}
+"""Episodes, frames of each, points of each."""
 WINDOWS = {
     OBS_POINT_CLOUD: [-1 / FPS, 0],
     "observation.state": [-1 / FPS, 0],
@@ -34,17 +36,19 @@ WINDOWS = {
 
 
 def main() -> None:
-    """Print times and ratios for 0 and 2 workers."""
+    """Print times and ratios for each number of workers."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", choices=SIZES, default="metaworld")
+    parser.add_argument("--workers", type=int, nargs="+", default=[0, 2], help="worker processes of the loader")
     args = parser.parse_args()
     n_episodes, length, n_points = SIZES[args.size]
+    print_provenance()
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "data"
         write(root, n_episodes, length, n_points)
         indices = np.random.default_rng(0).permutation(n_episodes * length).tolist()
         print(f"{n_episodes} episodes x {length} frames x {n_points} points, batches of {BATCH_SIZE}")
-        for n_workers in (0, 2):
+        for n_workers in args.workers:
             stock = measure(open_dataset(LeRobotDataset, root), indices, n_workers, n_batches=2)
             ours = measure(open_dataset(BatchedDataset, root), indices, n_workers, n_batches=len(indices) // BATCH_SIZE)
             print(

@@ -12,22 +12,17 @@ the same batch on two cores.
 """
 
 import argparse
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from common import CLOUD_POINTS, N_ACTIONS, N_STATES, make_policy, matrix_product_peak, print_provenance, timed
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-import lerobot_policy_uca_flow  # noqa: F401  (registers the policy)
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
-from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
-
-N_STATES, N_ACTIONS, CLOUD_POINTS = 9, 4, 512
+from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
 
 def main() -> None:
@@ -41,7 +36,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20)
     args = parser.parse_args()
 
-    policy, batch = make(args.dim, args.n_points, args.batch_size, args.dtype, args.device)
+    sizes = {"dim": args.dim, "n_points": args.n_points, "dtype": args.dtype}
+    policy = make_policy(device=args.device, **sizes).train()
+    batch = make_batch(policy, args.batch_size)
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     dtype = getattr(torch, args.dtype)
 
@@ -55,45 +52,36 @@ def main() -> None:
     rows = []
     for _ in range(args.steps + 2):
         optimizer.zero_grad()
-        encode, _ = timed(lambda: encode_only(policy, batch, dtype), args.device)
-        whole, loss = timed(forward, args.device)
-        backward, _ = timed(loss.backward, args.device)
-        step, _ = timed(lambda: (optimizer.step(), policy.update()), args.device)
+        encode, _ = timed(lambda: encode_only(policy, batch, dtype), device=args.device)
+        whole, loss = timed(forward, device=args.device)
+        backward, _ = timed(loss.backward, device=args.device)
+        step, _ = timed(lambda: (optimizer.step(), policy.update()), device=args.device)
         rows.append([encode, whole - encode, backward, step, whole + backward + step])
     stages = np.median(rows[2:], axis=0)
     peak = matrix_product_peak(dtype, args.device)
+    print_provenance()
     print(f"batch {args.batch_size}, dim {args.dim}, {args.n_points} points, {args.dtype} on {args.device}, ", end="")
     print(f"{torch.get_num_threads()} threads; median of {args.steps} steps")
     names = ("encoder, forward", "two passes and JVP, forward", "backward", "optimiser and moving average", "step")
-    for name, seconds in zip(names, stages, strict=True):
-        print(f"{name:32}{1e3 * seconds:9.1f} ms")
+    for name, milliseconds in zip(names, stages, strict=True):
+        print(f"{name:32}{milliseconds:9.1f} ms")
     for name, count in (("plain step", plain_flops), ("step made here", flops)):
-        print(f"{'floor, ' + name:32}{1e3 * count / peak:9.1f} ms", end="   ")
-        print(f"{count / 1e9:.1f} GFLOP at {peak / 1e9:.0f} GFLOP/s; the step takes {stages[-1] * peak / count:.1f} x")
+        floor = 1e3 * count / peak
+        print(f"{'floor, ' + name:32}{floor:9.1f} ms", end="   ")
+        print(f"{count / 1e9:.1f} GFLOP at {peak / 1e9:.0f} GFLOP/s; the step takes {stages[-1] / floor:.1f} x")
 
 
-def make(
-    dim: int, n_points: int, batch_size: int, dtype: str, device: str
-) -> tuple[UCAFlowPolicy, dict[str, torch.Tensor]]:
-    """A policy in training mode and a batch for it."""
-    features = {
-        OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (CLOUD_POINTS, 3)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (N_STATES,)),
-    }
-    action = {"action": PolicyFeature(FeatureType.ACTION, (N_ACTIONS,))}
-    config = UCAFlowConfig(
-        device=device, input_features=features, output_features=action, dim=dim, n_points=n_points, dtype=dtype
-    )
-    policy = UCAFlowPolicy(config).to(device).train()
-    batch = {
+def make_batch(policy: PointCloudPolicy, batch_size: int) -> dict[str, torch.Tensor]:
+    """A batch of random training windows."""
+    config, device = policy.config, policy.config.device
+    return {
         OBS_POINT_CLOUD: torch.rand(batch_size, config.n_obs_steps, CLOUD_POINTS, 3, device=device),
         "observation.state": torch.rand(batch_size, config.n_obs_steps, N_STATES, device=device),
         "action": torch.rand(batch_size, config.horizon, N_ACTIONS, device=device),
     }
-    return policy, batch
 
 
-def plain_step(policy: UCAFlowPolicy, batch: dict[str, torch.Tensor]) -> None:
+def plain_step(policy: PointCloudPolicy, batch: dict[str, torch.Tensor]) -> None:
     """The matrix products of the method as the paper writes it down."""
     x = batch["action"]
     encoder: Any = policy.model.encoder
@@ -137,25 +125,10 @@ class FlopCounter(TorchDispatchMode):
         return result
 
 
-def encode_only(policy: UCAFlowPolicy, batch: dict[str, torch.Tensor], dtype: torch.dtype) -> torch.Tensor:
+def encode_only(policy: PointCloudPolicy, batch: dict[str, torch.Tensor], dtype: torch.dtype) -> torch.Tensor:
     """The observation features, in the precision of the step."""
     with torch.autocast(str(batch["action"].device.type), dtype=dtype, enabled=dtype is not torch.float32):
         return policy._encode(policy.model, batch)
-
-
-def matrix_product_peak(dtype: torch.dtype, device: str, size: int = 2048) -> float:
-    """The best rate of a square matrix product [FLOP/s]."""
-    a, b = torch.randn(2, size, size, dtype=dtype, device=device)
-    return 2 * size**3 / min(timed(lambda: a @ b, device)[0] for _ in range(10))
-
-
-def timed(function: Callable[[], Any], device: str) -> tuple[float, Any]:
-    """Seconds a call takes, the device's work included, and its result."""
-    start = time.perf_counter()
-    result = function()
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter() - start, result
 
 
 if __name__ == "__main__":
