@@ -62,7 +62,11 @@ def test_the_installed_name_keeps_its_underscores():
 
 def test_only_our_console_commands_are_installed():
     scripts = importlib.metadata.distribution(DISTRIBUTION).entry_points
-    assert {script.name for script in scripts} == {"lerobot-uca-collect", "lerobot-uca-export"}
+    assert {script.name for script in scripts} == {
+        "lerobot-uca-calibrate",
+        "lerobot-uca-collect",
+        "lerobot-uca-export",
+    }
 
 
 def test_a_wheel_holds_the_package_and_nothing_else(tmp_path):

@@ -32,3 +32,13 @@ def export() -> None:
 
     register_third_party_plugins()
     run()
+
+
+def calibrate() -> None:
+    """`lerobot-uca-calibrate`."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_uca.robots.calibrate import run
+
+    register_third_party_plugins()
+    run()
