@@ -55,7 +55,7 @@ def measure(config: PointCloudEnvConfig, task: str, expert: Expert, n_steps: int
         simulator = env._simulator
         rays, points = timed(env._cloud_camera.capture, simulator.model, simulator.data, env._markers())
         sample, _ = timed(sample_farthest, points, env.n_points)
-        observe, _ = timed(env._observe)
+        observe, _ = timed(env.observe)
         picture, _ = timed(env.render)
         rows.append([step, rays, sample, observe, picture, len(points)])
     return np.array(rows)

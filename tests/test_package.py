@@ -63,6 +63,7 @@ def test_the_installed_name_keeps_its_underscores():
 def test_only_our_console_commands_are_installed():
     scripts = importlib.metadata.distribution(DISTRIBUTION).entry_points
     assert {script.name for script in scripts} == {
+        "lerobot-uca-benchmark",
         "lerobot-uca-calibrate",
         "lerobot-uca-collect",
         "lerobot-uca-export",
@@ -75,7 +76,7 @@ def test_a_wheel_holds_the_package_and_nothing_else(tmp_path):
     (wheel,) = tmp_path.glob("*.whl")
     names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
     assert {name.split("/")[0] for name in names} == {"lerobot_uca", "lerobot_policy_uca_flow.py"}
-    assert len(names) == len(list(SOURCE.rglob("*.py"))) + 1
+    assert len(names) == sum(len(list(SOURCE.rglob(kind))) for kind in ("*.py", "*.yaml")) + 1
 
 
 def test_lerobot_discovers_everything_in_a_fresh_interpreter():

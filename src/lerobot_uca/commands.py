@@ -42,3 +42,14 @@ def calibrate() -> None:
 
     register_third_party_plugins()
     run()
+
+
+def benchmark() -> None:
+    """`lerobot-uca-benchmark`."""
+    from lerobot_uca.errors import UserError
+    from lerobot_uca.protocol.command import main
+
+    try:
+        main()
+    except UserError as error:
+        sys.exit(f"error: {error}")

@@ -215,9 +215,9 @@ class AdroitPointCloudEnv(PointCloudEnv):
             raise UserError(f"Adroit {self.task}: an initial state has {fields}, got {got}.")
         self.expert_observation, _ = simulator.reset(seed=seed, options=options)
         self._n_steps = 0
-        return self._observe(), {"is_success": False}
+        return self.observe(), {"is_success": False}
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def act(self, action: NDArray[np.float32]) -> tuple[float, bool, bool, dict[str, Any]]:
         """Execute an action for 20 ms of simulated time."""
         own_action = self._clipped(action)[self._own_joints]
         simulator = self._running_simulator()
@@ -230,7 +230,7 @@ class AdroitPointCloudEnv(PointCloudEnv):
         self._n_steps += 1
         truncated = self._n_steps >= self._max_episode_steps
         verdict = self._judge(self._task, Outcome(self.expert_observation, bool(info["success"]), truncated))
-        return self._observe(), float(rewards), verdict.terminated, truncated, {"is_success": verdict.is_success}
+        return float(rewards), verdict.terminated, truncated, {"is_success": verdict.is_success}
 
     def from_own(self, action: Array) -> NDArray[np.float32]:
         """The environment's action for one of the task's own joints: clipped, and 0 for joints of other tasks."""

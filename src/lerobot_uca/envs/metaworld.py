@@ -127,15 +127,15 @@ class MetaworldPointCloudEnv(PointCloudEnv):
         # Meta-World moves bodies by editing the model and leaves the poses in the data behind.
         mujoco.mj_forward(self._simulator.model, self._simulator.data)
         self._n_steps = 0
-        return self._observe(), {"is_success": False}
+        return self.observe(), {"is_success": False}
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def act(self, action: NDArray[np.float32]) -> tuple[float, bool, bool, dict[str, Any]]:
         """Execute an action for 12.5 ms of simulated time."""
         action = self._clipped(action)
         self.expert_observation, reward, _, _, info = self._running_simulator().step(action)
         self._n_steps += 1
         success = bool(info["success"])
-        return self._observe(), float(reward), success, self._n_steps >= EPISODE_LENGTH, {"is_success": success}
+        return float(reward), success, self._n_steps >= EPISODE_LENGTH, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
         """The scene as a shaded ray-cast picture, (320, 320, 3) uint8."""

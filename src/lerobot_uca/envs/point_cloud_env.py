@@ -71,6 +71,33 @@ class PointCloudEnv(gym.Env[Any, Any]):
         self._picture: PictureCamera | None = None
         self._n_steps = 0
 
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Execute an action and observe what it has led to."""
+        reward, terminated, truncated, info = self.act(action)
+        return self.observe(), reward, terminated, truncated, info
+
+    @abstractmethod
+    def act(self, action: NDArray[np.float32]) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Execute an action without observing: reward, terminated, truncated and info, as `step` returns them.
+
+        Observing takes most of a step, and a policy that plans several actions ahead does not look at all of them.
+        """
+
+    def observe(self) -> Observation:
+        """The present state. Asking twice gives the same twice."""
+        simulator, camera = self._running_simulator(), self._cloud_camera.camera
+        points = self._cloud_camera.capture(simulator.model, simulator.data, self._markers())
+        if len(points) == 0:
+            position = tuple(camera.position.tolist())
+            raise UserError(
+                f"{self.benchmark} {self.task}: the cloud is empty. Camera {camera.name} at {position} m "
+                f"sees no point inside the crop {self.crop.low} to {self.crop.high} m."
+            )
+        return {
+            "point_cloud": sample_farthest(points, self.n_points),
+            "agent_pos": self._agent_pos().astype(np.float32),
+        }
+
     def render(self) -> NDArray[np.uint8]:
         """The scene as a shaded ray-cast picture, (320, 320, 3) uint8."""
         simulator = self._running_simulator()
@@ -89,20 +116,6 @@ class PointCloudEnv(gym.Env[Any, Any]):
     def _markers(self) -> Sequence[Marker]:
         """Goals that no geom shows."""
         return ()
-
-    def _observe(self) -> Observation:
-        simulator, camera = self._simulator, self._cloud_camera.camera
-        points = self._cloud_camera.capture(simulator.model, simulator.data, self._markers())
-        if len(points) == 0:
-            position = tuple(camera.position.tolist())
-            raise UserError(
-                f"{self.benchmark} {self.task}: the cloud is empty. Camera {camera.name} at {position} m "
-                f"sees no point inside the crop {self.crop.low} to {self.crop.high} m."
-            )
-        return {
-            "point_cloud": sample_farthest(points, self.n_points),
-            "agent_pos": self._agent_pos().astype(np.float32),
-        }
 
     def _clipped(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """What is executed of an action."""

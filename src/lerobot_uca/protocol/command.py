@@ -1,0 +1,63 @@
+"""`lerobot-uca-benchmark`: its command line."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid
+from lerobot_uca.protocol.launchers import local, n_cores
+from lerobot_uca.protocol.run import make_folder, run
+
+RUN_HELP = f"""\
+Train and evaluate every policy on every task with every seed, and go on where an earlier run was.
+
+  lerobot-uca-benchmark run --suite=paper --policies=uca_flow --seeds=0 --setting=small --output=runs/small \\
+      --expert='experts/{{task}}.npz'
+
+Each (task, policy, seed) is a cell with a folder of its own. Several processes, also on several machines that share
+the disk, may work on one output folder: each takes the cells that nobody else works on. Stop with Ctrl-C.
+
+suites:   {", ".join(SUITES)}
+groups:   {", ".join(PAPER_GROUPS)}
+policies: {", ".join(POLICIES)}
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Do what the command line says."""
+    parser = argparse.ArgumentParser(
+        prog="lerobot-uca-benchmark", description="The papers' comparison: run it, report it."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    _add_run(commands)
+    args = parser.parse_args(arguments)
+    args.do(args)
+
+
+def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    parser = commands.add_parser(
+        "run",
+        help="train and evaluate what is missing",
+        description=RUN_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--output", type=Path, required=True, help="folder of the run; made if it is not there")
+    parser.add_argument("--suite", default="paper", help="set of tasks (default: paper)")
+    parser.add_argument("--tasks", help="tasks or groups out of the suite, separated by commas (default: all)")
+    parser.add_argument("--policies", default="uca_flow", help="separated by commas (default: uca_flow)")
+    parser.add_argument("--seeds", default="0,1,2", help="of training; 100 and up are for tuning (default: 0,1,2)")
+    parser.add_argument("--setting", default="small", help="small, paper, or a YAML file's path (default: small)")
+    parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
+    parser.add_argument("--parallel", type=int, default=n_cores(), help="cells at once (default: one a core)")
+    parser.set_defaults(do=_run)
+
+
+def _run(args: argparse.Namespace) -> None:
+    cells = grid(args.suite, args.tasks, args.policies, args.seeds)
+    if args.parallel < 1:
+        raise UserError(f"--parallel must be at least 1, got {args.parallel}.")
+    if not run(make_folder(args.output, args.setting), cells, local(args.parallel), args.expert):
+        sys.exit(1)

@@ -1,0 +1,166 @@
+"""The folder of a run: where everything lies, and who works on which cell.
+
+DIR/setting.json                               the setting of all cells
+DIR/progress.log                               a line for each thing that happened
+DIR/demonstrations/TASK/                       the dataset that all cells of a task share
+DIR/cells/TASK/POLICY/SEED/training/           LeRobot's output folder
+                          /rows/step_*.csv     evaluations during training, rows/final.csv the last one
+                          /cell.json           written when the cell is finished
+                          /failure.json        why it is not
+                          /*.log               what collecting and training printed
+"""
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any, Self
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.rows import CorruptRow, Row, read_rows
+from lerobot_uca.protocol.setting import Setting
+
+
+class CellFolder:
+    """The files of one cell."""
+
+    def __init__(self, root: Path, cell: Cell) -> None:
+        self.cell = cell
+        self.path = root / "cells" / cell.task / cell.policy / str(cell.seed)
+        self.training = self.path / "training"
+        self.rows = self.path / "rows"
+        self.result = self.path / "cell.json"
+        self.failure = self.path / "failure.json"
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.result.exists()
+
+    @contextmanager
+    def claim(self) -> Iterator[TextIOWrapper | None]:
+        """The lock of this cell, or None while another process, here or on the shared disk, holds it.
+
+        It is the operating system's: it ends with the process that holds it, however that ends. A child that is given
+        the file keeps the cell claimed as long as it lives.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        with _locked(self.path / "lock", fcntl.LOCK_EX | fcntl.LOCK_NB) as file:
+            yield file
+
+
+class RunFolder:
+    """The folder of a run."""
+
+    def __init__(self, path: Path, setting: Setting) -> None:
+        self.path, self.setting = path.absolute(), setting
+
+    @classmethod
+    def create(cls, path: Path, setting: Setting) -> Self:
+        """The folder, made if it is not there.
+
+        Raises:
+            UserError: if it cannot be written, or was made with another setting.
+        """
+        file = path / "setting.json"
+        values = json.loads(json.dumps(setting.as_values()))
+        try:
+            (path / "demonstrations").mkdir(parents=True, exist_ok=True)
+            with _locked(path / "lock", fcntl.LOCK_EX):
+                if not file.exists():
+                    write_json(file, values)
+        except OSError as error:
+            raise UserError(f"--output '{path}' cannot be written: {error}") from error
+        difference = _first_difference(_read_json(file), values)
+        if difference:
+            raise UserError(
+                f"'{path}' was made with another setting: {difference}. Choose another --output, or the same --setting."
+            )
+        return cls(path, setting)
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """A folder that is there.
+
+        Raises:
+            UserError: if it is not one.
+        """
+        file = path / "setting.json"
+        if not file.is_file():
+            raise UserError(f"'{path}' is not the folder of a benchmark run: it has no setting.json.")
+        values = _read_json(file)
+        name = values.pop("name") if isinstance(values, dict) and "name" in values else path.name
+        return cls(path, Setting.from_values(name, values))
+
+    def cell(self, cell: Cell) -> CellFolder:
+        """The files of a cell."""
+        return CellFolder(self.path, cell)
+
+    @contextmanager
+    def demonstrations(self, cell: Cell) -> Iterator[Path]:
+        """Where a task's dataset is or belongs, for one process at a time."""
+        folder = self.path / "demonstrations" / cell.task
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(folder.with_name(f".{folder.name}.lock"), fcntl.LOCK_EX):
+            yield folder
+
+    def log(self, message: str) -> None:
+        """Print a line with the time, and add it to progress.log. One write: lines of several processes do not mix."""
+        line = f"{datetime.now(UTC).astimezone():%Y-%m-%d %H:%M:%S} {message}"
+        print(line, flush=True)
+        with (self.path / "progress.log").open("a", encoding="utf-8") as file:
+            file.write(f"{line}\n")
+
+    def read(self) -> Iterator[Row | CorruptRow]:
+        """All rows of all cells, and the lines that are not rows."""
+        for path in sorted(self.path.glob("cells/*/*/*/*/rows/*.csv")):
+            yield from read_rows(path)
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write a JSON file, whole or not at all."""
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    unfinished.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    unfinished.replace(path)
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"'{path}' cannot be read: {error}") from error
+
+
+def _first_difference(made: Any, given: Any, name: str = "") -> str | None:
+    """The first value in which two settings differ, described; None if there is none. Names and words do not count."""
+    if isinstance(made, dict) and isinstance(given, dict):
+        for key in dict.fromkeys([*made, *given]):
+            if not name and key in ("name", "description"):
+                continue
+            difference = _first_difference(made.get(key), given.get(key), f"{name}.{key}" if name else key)
+            if difference:
+                return difference
+        return None
+    return None if made == given else f"{name} was {json.dumps(made)}, now it is {json.dumps(given)}"
+
+
+@contextmanager
+def _locked(path: Path, operation: int) -> Iterator[TextIOWrapper | None]:
+    with path.open("a", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, operation)
+        except BlockingIOError:
+            yield None
+            return
+        yield file
+
+
+def free_bytes(path: Path) -> int:
+    """Free space on the disk of a folder."""
+    status = os.statvfs(path)
+    return status.f_bavail * status.f_frsize

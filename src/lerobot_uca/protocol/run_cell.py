@@ -1,0 +1,194 @@
+"""One cell from demonstrations to result: `python -m lerobot_uca.protocol.run_cell DIR TASK POLICY SEED`.
+
+It is a process of its own, so that whatever happens to it happens to one cell. Started again, it goes on where it was:
+in the training from LeRobot's last checkpoint, and with the first evaluation whose rows are missing.
+"""
+
+import logging
+import shutil
+import sys
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import IntEnum
+from io import TextIOWrapper
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol import training
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.folder import CellFolder, RunFolder, write_json
+from lerobot_uca.protocol.rows import CorruptRow, Row, read_rows, write_rows
+from lerobot_uca.protocol.tied import tie_to_parent
+from lerobot_uca.protocol.training import CellError, NoSpaceError, no_space_as_such
+
+if TYPE_CHECKING:
+    from lerobot_uca.protocol.evaluation import PolicyPlan
+
+N_ENVS = 10
+"""Episodes at once: enough to share the policy's calls."""
+
+
+class Outcome(IntEnum):
+    """How a cell's process ends: its exit code."""
+
+    FINISHED = 0
+    FAILED = 1
+    CLAIMED = 3
+    """Another process works on it."""
+    NO_SPACE = 28
+
+
+def run_cell(folder: RunFolder, cell: Cell, expert: str | None) -> Outcome:
+    """Do what is left of a cell, unless another process does. A failure is recorded, with its reason."""
+    files = folder.cell(cell)
+    try:
+        with no_space_as_such(), files.claim() as lock:
+            if lock is None:
+                return Outcome.CLAIMED
+            if not files.is_finished:
+                _work(folder, cell, expert, lock)
+            return Outcome.FINISHED
+    except NoSpaceError as error:
+        _try_to_log(folder, f"{cell}: {error}")
+        return Outcome.NO_SPACE
+    except (CellError, UserError) as error:
+        reason = str(error)
+    except Exception as error:  # noqa: BLE001 (whatever it is, it concerns this cell alone)
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        with (files.path / "training.log").open("a", encoding="utf-8") as file:
+            traceback.print_exc(file=file)
+    write_json(files.failure, {"reason": reason})
+    return Outcome.FAILED
+
+
+def _work(folder: RunFolder, cell: Cell, expert: str | None, lock: TextIOWrapper) -> None:
+    files, setting = folder.cell(cell), folder.setting
+    length = setting.length(cell)
+    dataset = training.collect(folder, cell, expert)
+    if training.checkpoint(files, length.steps) is None:
+        folder.log(f"{cell}: training {length.steps} steps")
+    with _minutes(files, "training"):
+        training.train(files, setting, dataset, lock)
+    with _minutes(files, "evaluation"):
+        _evaluate(folder, cell, dataset)
+    final = [row for row in read_rows(files.rows / "final.csv") if isinstance(row, Row)]
+    write_json(files.result, _result(folder, cell, final))
+    files.failure.unlink(missing_ok=True)
+
+
+def _evaluate(folder: RunFolder, cell: Cell, dataset: Path) -> None:
+    """Make the rows that are missing. A checkpoint whose rows are there is removed, unless it is the last one."""
+    files, setting = folder.cell(cell), folder.setting
+    length = setting.length(cell)
+    files.rows.mkdir(exist_ok=True)
+    for step in range(length.interval, length.steps + 1, length.interval):
+        _evaluate_checkpoint(folder, cell, dataset, step, is_final=False)
+        done = training.checkpoint(files, step)
+        if done is not None and step < length.steps:
+            shutil.rmtree(done.parent)
+    _evaluate_checkpoint(folder, cell, dataset, length.steps, is_final=True)
+
+
+def _evaluate_checkpoint(folder: RunFolder, cell: Cell, dataset: Path, step: int, *, is_final: bool) -> None:
+    """Write an evaluation's rows, unless they are there."""
+    files, setting = folder.cell(cell), folder.setting
+    path = files.rows / ("final.csv" if is_final else f"step_{step:06d}.csv")
+    if path.exists() and not any(isinstance(row, CorruptRow) for row in read_rows(path)):
+        return
+    from lerobot_uca.protocol.evaluation import PolicyPlan, run_episodes
+
+    checkpoint = training.checkpoint(files, step)
+    if checkpoint is None:
+        raise CellError(f"its checkpoint after {step} steps is gone. Remove '{files.path}' to train anew")
+    plan = PolicyPlan.from_checkpoint(checkpoint)
+    epoch = step * setting.batch_size / _n_frames(dataset)
+    index = step // setting.length(cell).interval - 1
+    seeds = setting.final_seeds(cell) if is_final else setting.interim_seeds(cell, index)
+    episodes = run_episodes(_make_env(cell, plan), plan.config, plan, seeds, n_envs=N_ENVS)
+    rows = [
+        Row(*cell, step, epoch, is_final, each.seed, each.success, each.episode_return, each.length, each.ms)
+        for each in episodes
+    ]
+    rows.sort(key=lambda row: row.episode_seed)
+    write_rows(path, rows)
+    success = 100 * sum(row.success for row in rows) / len(rows)
+    folder.log(f"{cell}: after {step} steps {success:.0f} % of {len(rows)} {'fresh ' * is_final}episodes")
+
+
+def _make_env(cell: Cell, plan: "PolicyPlan") -> Any:
+    """Makes the cell's environment, with no more points than the policy looks at: the first ones are the same."""
+    from lerobot.envs.configs import EnvConfig
+
+    config = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
+    config.n_points = plan.config.n_points or config.n_points
+    return config.env_factory(cell.env_task)
+
+
+def _n_frames(dataset: Path) -> int:
+    import json
+
+    return json.loads((dataset / "meta" / "info.json").read_text(encoding="utf-8"))["total_frames"]
+
+
+def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
+    from lerobot_uca.protocol.latency import measure
+    from lerobot_uca.protocol.record import provenance
+
+    files, setting = folder.cell(cell), folder.setting
+    checkpoint = training.checkpoint(files, setting.length(cell).steps)
+    assert checkpoint is not None
+    return {
+        "cell": cell._asdict(),
+        "success": sum(row.success for row in final) / len(final),
+        "episodes": len(final),
+        "minutes": {phase: _read_minutes(files, phase) for phase in ("training", "evaluation")},
+        "inference": measure(checkpoint),
+        "setting": setting.as_values(),
+        "training_options": training.training_options(cell, setting),
+        **provenance(),
+    }
+
+
+@contextmanager
+def _minutes(files: CellFolder, phase: str) -> Iterator[None]:
+    """Add the time of a phase to what earlier processes of this cell have needed for it."""
+    begin = time.monotonic()
+    try:
+        yield
+    finally:
+        path = files.path / f"{phase}_minutes.txt"
+        path.write_text(f"{_read_minutes(files, phase) + (time.monotonic() - begin) / 60:.3f}\n", encoding="utf-8")
+
+
+def _read_minutes(files: CellFolder, phase: str) -> float:
+    try:
+        return float((files.path / f"{phase}_minutes.txt").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return 0.0
+
+
+def _try_to_log(folder: RunFolder, message: str) -> None:
+    try:
+        folder.log(message)
+    except OSError:
+        print(message, file=sys.stderr)
+
+
+def main() -> None:
+    """Run the cell that the command line names."""
+    tie_to_parent()
+    path, task, policy, seed, *expert = sys.argv[1:]
+    import torch
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    logging.disable(logging.INFO)
+    torch.set_num_threads(1)
+    sys.exit(run_cell(RunFolder.open(Path(path)), Cell(task, policy, int(seed)), expert[0] if expert else None))
+
+
+if __name__ == "__main__":
+    main()

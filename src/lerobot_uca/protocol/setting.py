@@ -1,0 +1,138 @@
+"""How cells are trained and evaluated: a YAML file, by name those of this package's folder `settings`."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol.cells import POLICIES, Cell
+
+FOLDER = files("lerobot_uca.protocol") / "settings"
+
+FIRST_TUNING_SEED = 100
+"""Training seeds from here on are for choosing a setting. Their episodes are others than those of the tables."""
+INTERIM_SEEDS, FINAL_SEEDS, TUNING_OFFSET = 2_000_000, 4_000_000, 10_000_000
+"""Where the seeds of evaluation episodes start. Demonstrations start at 1 million, LeRobot's evaluations at 1000."""
+
+
+@dataclass(frozen=True)
+class Length:
+    """How long a task is trained, and how often it is evaluated meanwhile."""
+
+    steps: int
+    evaluations: int
+    """Evenly spaced, the last one after the last step."""
+
+    @property
+    def interval(self) -> int:
+        """Steps between two evaluations."""
+        return self.steps // self.evaluations
+
+
+@dataclass(frozen=True)
+class Setting:
+    """All that decides a cell's result besides task, policy and seed."""
+
+    name: str
+    """Of the file, without its ending."""
+    description: str
+    """One line, printed with every table."""
+    batch_size: int
+    lengths: Mapping[str, Length]
+    """By 'benchmark' or 'benchmark/task'; the latter counts where both are there."""
+    demonstrations: int = 10
+    """Expert episodes of a task."""
+    interim_episodes: int = 20
+    """Episodes of each evaluation during training."""
+    final_episodes: int = 100
+    """Episodes of the last checkpoint's evaluation, on seeds that nothing else uses."""
+    policy: Mapping[str, Any] = field(default_factory=dict)
+    """Options of all policies."""
+    policies: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Further options by policy type."""
+
+    @classmethod
+    def load(cls, name: str) -> Self:
+        """The setting of a name, or of a YAML file's path.
+
+        Raises:
+            UserError: if there is none, or it does not hold what a setting holds.
+        """
+        known = {Path(file.name).stem: file for file in FOLDER.iterdir() if file.name.endswith(".yaml")}
+        path = Path(name)
+        if name not in known and not path.is_file():
+            raise UserError(f"Unknown setting '{name}'. Settings: {', '.join(sorted(known))}, or a YAML file's path.")
+        try:
+            values = yaml.safe_load(known.get(name, path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise UserError(f"Setting '{name}' cannot be read: {' '.join(str(error).split())}") from error
+        return cls.from_values(path.stem, values)
+
+    @classmethod
+    def from_values(cls, name: str, values: Any) -> Self:
+        """From what a YAML file holds."""
+        valid = [each.name for each in fields(cls) if each.name != "name"]
+        if not isinstance(values, dict) or not set(values) <= set(valid):
+            got = ", ".join(map(str, values)) if isinstance(values, dict) else type(values).__name__
+            raise UserError(f"Setting '{name}' may hold {', '.join(valid)}, got {got}.")
+        try:
+            lengths = {key: Length(**length) for key, length in values["lengths"].items()}
+            setting = cls(**{**values, "name": name, "lengths": lengths})
+        except (KeyError, TypeError, AttributeError) as error:
+            raise UserError(f"Setting '{name}' is not complete: {error}.") from error
+        setting.check()
+        return setting
+
+    def check(self) -> None:
+        """Raise a `UserError` for values that cannot be."""
+        counts = ("batch_size", "demonstrations", "interim_episodes", "final_episodes")
+        for name, value in [(name, getattr(self, name)) for name in counts]:
+            if not isinstance(value, int) or value < 1:
+                raise UserError(f"Setting '{self.name}': {name} must be a whole number above 0, got {value!r}.")
+        for key, length in self.lengths.items():
+            if length.evaluations < 1 or length.steps < 1 or length.steps % length.evaluations:
+                raise UserError(
+                    f"Setting '{self.name}': steps of {key} must be a multiple of its evaluations, "
+                    f"got {length.steps} and {length.evaluations}."
+                )
+        types = {method.type for method in POLICIES.values()}
+        for policy_type in self.policies:
+            if policy_type not in types:
+                raise UserError(
+                    f"Setting '{self.name}': policies holds options by type ({', '.join(sorted(types))}), "
+                    f"got '{policy_type}'."
+                )
+
+    def as_values(self) -> dict[str, Any]:
+        """As plain values, for JSON."""
+        return asdict(self)
+
+    def length(self, cell: Cell) -> Length:
+        """How long a cell is trained."""
+        for key in (cell.task, cell.benchmark):
+            if key in self.lengths:
+                return self.lengths[key]
+        raise UserError(f"Setting '{self.name}' has no length for {cell.task}: lengths of {', '.join(self.lengths)}.")
+
+    def policy_options(self, policy: str) -> dict[str, Any]:
+        """Options of a policy by name, without 'policy.'."""
+        method = POLICIES[policy]
+        return {"type": method.type, **self.policy, **self.policies.get(method.type, {}), **method.options}
+
+    def interim_seeds(self, cell: Cell, evaluation: int) -> range:
+        """Seeds of the episodes of a cell's evaluation 0, 1, ... during training: the same for all policies."""
+        first = INTERIM_SEEDS + _tuning(cell) + evaluation * self.interim_episodes
+        return range(first, first + self.interim_episodes)
+
+    def final_seeds(self, cell: Cell) -> range:
+        """Seeds of the episodes of a cell's last checkpoint: the same for all policies, used by nothing else."""
+        first = FINAL_SEEDS + _tuning(cell)
+        return range(first, first + self.final_episodes)
+
+
+def _tuning(cell: Cell) -> int:
+    return TUNING_OFFSET if cell.seed >= FIRST_TUNING_SEED else 0

@@ -1,0 +1,172 @@
+"""Demonstrations and training of a cell, by the commands that a user would type, each in a process of its own."""
+
+import errno
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import TextIOWrapper
+from pathlib import Path
+from typing import Any
+
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.folder import CellFolder, RunFolder
+from lerobot_uca.protocol.setting import Setting
+
+LOG_TAIL = 2000  # characters in which a failing command has said why
+
+
+class CellError(Exception):
+    """Why a cell has failed, in one line. The other cells go on."""
+
+
+class NoSpaceError(Exception):
+    """The disk is full: no cell can go on."""
+
+
+def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
+    """The task's demonstrations, made if they are not there. Others who need them wait."""
+    with folder.demonstrations(cell) as dataset:
+        if not (dataset / "meta" / "info.json").exists():
+            shutil.rmtree(dataset, ignore_errors=True)
+            folder.log(f"{cell.task}: collecting {folder.setting.demonstrations} demonstrations")
+            options = {
+                "env.type": cell.env_type,
+                "env.task": cell.env_task,
+                "repo_id": repo_id(cell),
+                "root": dataset,
+                "n_episodes": folder.setting.demonstrations,
+            }
+            if expert is not None and cell.benchmark == "adroit":
+                options["expert"] = expert
+            run("lerobot-uca-collect", as_arguments(options), log=folder.cell(cell).path / "collect.log")
+        return dataset
+
+
+def train(cell_folder: CellFolder, setting: Setting, dataset: Path, lock: TextIOWrapper) -> None:
+    """Train to the last step, from the last checkpoint if there is one."""
+    cell, training = cell_folder.cell, cell_folder.training
+    checkpoints = training / "checkpoints"
+    if checkpoint(cell_folder, setting.length(cell).steps) is not None:
+        return
+    options: dict[str, Any] = {"dataset.root": dataset, "output_dir": training}
+    last = checkpoints / "last" / "pretrained_model" / "train_config.json"
+    if last.exists():
+        options |= {"config_path": last, "resume": True}
+    else:
+        shutil.rmtree(training, ignore_errors=True)
+        options |= training_options(cell, setting)
+    run("lerobot-train", as_arguments(options), log=cell_folder.path / "training.log", keep=lock)
+
+
+def training_options(cell: Cell, setting: Setting) -> dict[str, Any]:
+    """Options of a new training, besides its folders."""
+    length = setting.length(cell)
+    policy = {f"policy.{name}": value for name, value in setting.policy_options(cell.policy).items()}
+    return {
+        "dataset.repo_id": repo_id(cell),
+        **policy,
+        "policy.push_to_hub": False,
+        "batch_size": setting.batch_size,
+        "steps": length.steps,
+        "save_freq": length.interval,
+        "env_eval_freq": 0,
+        "num_workers": 0,
+        "log_freq": max(1, length.steps // 100),
+        "seed": cell.seed,
+    }
+
+
+def checkpoint(cell_folder: CellFolder, step: int) -> Path | None:
+    """The folder of the weights after some steps, if they are there whole.
+
+    LeRobot writes the training's state after the weights, and 'last' after both.
+    """
+    checkpoints = cell_folder.training / "checkpoints"
+    for folder in checkpoints.glob("[0-9]*"):
+        if int(folder.name) == step and (checkpoints / "last").exists() and step <= _last_step(checkpoints):
+            return folder / "pretrained_model"
+    return None
+
+
+def _last_step(checkpoints: Path) -> int:
+    return int((checkpoints / "last").resolve().name)
+
+
+def repo_id(cell: Cell) -> str:
+    """The name of a task's dataset."""
+    return f"local/{cell.task.replace('/', '-')}"
+
+
+def as_arguments(options: dict[str, Any]) -> list[str]:
+    """Options as draccus reads them."""
+    return [f"--{name}={_as_text(value)}" for name, value in options.items()]
+
+
+def _as_text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | None = None) -> None:
+    """Run a command of this environment; what it prints is added to a log.
+
+    Args:
+        program: its name.
+        arguments: its arguments.
+        log: a file.
+        keep: a lock that is held as long as the command runs, even if this process does not live as long.
+
+    Raises:
+        CellError: if it fails; says how, and the last thing it has printed.
+        NoSpaceError: if it fails for want of space.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "lerobot_uca.protocol.tied", str(Path(sys.executable).with_name(program))]
+    with log.open("a", encoding="utf-8") as file:
+        file.write(f"$ {program} {' '.join(arguments)}\n")
+        file.flush()
+        start = file.tell()
+        keep_open = () if keep is None else (keep.fileno(),)
+        result = subprocess.run(  # noqa: S603
+            [*command, *arguments], stdout=file, stderr=file, stdin=subprocess.DEVNULL, pass_fds=keep_open, check=False
+        )
+    if result.returncode:
+        said = _tail(log, start)
+        if os.strerror(errno.ENOSPC) in said or os.strerror(errno.EDQUOT) in said:
+            raise NoSpaceError(f"{program} found no space left on the disk of '{log.parent}'.")
+        raise CellError(f"{program} {ended(result.returncode)}: {_last_line(said)} (see {log})")
+
+
+def ended(returncode: int) -> str:
+    """How a process has ended, in words."""
+    if returncode >= 0:
+        return f"ended with exit code {returncode}"
+    name = signal.Signals(-returncode).name
+    hint = ", as processes are when the memory is full" if -returncode == signal.SIGKILL else ""
+    return f"was killed by {name}{hint}"
+
+
+def _tail(log: Path, start: int) -> str:
+    with log.open("rb") as file:
+        file.seek(max(start, log.stat().st_size - LOG_TAIL))
+        return file.read().decode(errors="replace")
+
+
+def _last_line(text: str) -> str:
+    lines = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
+    errors = [line for line in lines if line.startswith("error: ")]
+    return (errors or lines or ["it has printed nothing"])[-1].removeprefix("error: ")
+
+
+@contextmanager
+def no_space_as_such() -> Iterator[None]:
+    """Raise a `NoSpaceError` for an OSError of a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise NoSpaceError(str(error)) from error
+        raise

@@ -1,0 +1,121 @@
+"""The command, end to end and tiny, with real trainings."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from tests.builders import N_POINTS, write_dataset
+
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.folder import RunFolder
+from lerobot_uca.protocol.rows import Row
+from lerobot_uca.protocol.setting import Setting
+
+TASK = "metaworld/drawer-close"
+GOOD, BAD = Cell(TASK, "uca_flow", 0), Cell(TASK, "simple_dp3", 0)
+TINY = {
+    "description": "as small as can be",
+    "batch_size": 4,
+    "lengths": {"metaworld": {"steps": 4, "evaluations": 2}, "adroit": {"steps": 4, "evaluations": 2}},
+    "demonstrations": 1,
+    "interim_episodes": 1,
+    "final_episodes": 2,
+    "policy": {"device": "cpu", "n_points": N_POINTS, "inference": "eager"},
+    "policies": {"uca_flow": {"dim": 16, "n_layers": 1, "n_heads": 2}, "simple_dp3": {"horizon": 3}},
+}
+
+
+def benchmark(output: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    command = [Path(sys.executable).with_name("lerobot-uca-benchmark"), "run", f"--output={output}", "--parallel=1"]
+    return subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+
+
+def make_run(output: Path) -> RunFolder:
+    """A folder that has its demonstrations; collecting them has tests of its own."""
+    folder = RunFolder.create(output, Setting.from_values("tiny", TINY))
+    with folder.demonstrations(GOOD) as dataset:
+        write_dataset(dataset)
+    (output / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> tuple[RunFolder, subprocess.CompletedProcess[str]]:
+    """A run of two cells, of which the first cannot be trained."""
+    folder = make_run(tmp_path_factory.mktemp("run"))
+    options = ["--tasks=drawer-close", "--policies=simple_dp3,uca_flow", "--seeds=0"]
+    return folder, benchmark(folder.path, f"--setting={folder.path}/tiny.yaml", *options)
+
+
+def test_a_cell_that_fails_is_recorded_and_the_rest_goes_on(finished):
+    folder, result = finished
+    assert result.returncode == 1
+    assert "Traceback" not in result.stdout + result.stderr
+    reason = json.loads(folder.cell(BAD).failure.read_text())["reason"]
+    assert reason.startswith("lerobot-train ended with exit code 1: policy.horizon must be at least")
+    assert f"{BAD} FAILED: lerobot-train" in result.stdout
+    assert folder.cell(GOOD).is_finished
+    assert not folder.cell(BAD).is_finished
+
+
+def test_there_is_a_row_for_each_episode(finished):
+    folder, _ = finished
+    rows = list(folder.read())
+    assert all(isinstance(row, Row) for row in rows)
+    assert {row.cell for row in rows} == {GOOD}
+    setting = folder.setting
+    expected = [(4, True, seed) for seed in setting.final_seeds(GOOD)]
+    expected += [
+        (step, False, seed) for index, step in enumerate((2, 4)) for seed in setting.interim_seeds(GOOD, index)
+    ]
+    assert [(row.step, row.is_final, row.episode_seed) for row in rows] == expected
+    assert all(row.length == 200 or row.success for row in rows)
+    assert {row.epoch for row in rows} == {round(step * 4 / 39, 2) for step in (2, 4)}  # of 39 frames
+
+
+def test_a_result_says_how_it_was_made(finished):
+    folder, _ = finished
+    result = json.loads(folder.cell(GOOD).result.read_text())
+    assert result["cell"] == GOOD._asdict()
+    assert result["setting"] == folder.setting.as_values()
+    assert result["versions"]["lerobot"] == "0.6.1"
+    assert result["hardware"]["cores"] >= 1
+    assert result["minutes"]["training"] > 0
+    assert result["inference"]["median_ms"] > 0
+    checkpoints = folder.cell(GOOD).training / "checkpoints"
+    assert {path.name for path in checkpoints.iterdir()} == {"000004", "last"}
+
+
+def test_progress_is_in_a_log_file(finished):
+    folder, result = finished
+    log = (folder.path / "progress.log").read_text()
+    assert "2 of 2 cells to do, setting 'tiny'" in log
+    assert "[2/2, 0:00 h left]" in log
+    assert "finished: 1, failed: 1, being worked on by another process: 0" in log
+    assert set(log.splitlines()) <= set(result.stdout.splitlines())
+
+
+def test_a_finished_cell_is_not_done_again(finished):
+    folder, _ = finished
+    files = folder.cell(GOOD)
+    before = {path: path.stat().st_mtime_ns for path in files.path.rglob("*")}
+    options = ["--tasks=drawer-close", "--policies=uca_flow", "--seeds=0", f"--setting={folder.path}/tiny.yaml"]
+    result = benchmark(folder.path, *options)
+    assert result.returncode == 0, result.stderr
+    assert "0 of 1 cells to do" in result.stdout
+    assert {path: path.stat().st_mtime_ns for path in files.path.rglob("*")} == before
+
+
+def test_another_setting_is_refused(finished):
+    folder, _ = finished
+    result = benchmark(folder.path, "--tasks=drawer-close", "--setting=small")
+    assert result.returncode == 1
+    assert result.stderr.startswith(f"error: '{folder.path}' was made with another setting: batch_size was 4, now")
+
+
+def test_adroit_needs_an_expert(tmp_path):
+    result = benchmark(tmp_path / "run", "--tasks=adroit/door", "--seeds=0")
+    assert result.stderr.startswith("error: Adroit has no expert built in. Give one with --expert=")

@@ -1,0 +1,86 @@
+from itertools import combinations
+
+import pytest
+import yaml
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol.cells import POLICIES, SUITES, Cell
+from lerobot_uca.protocol.setting import FIRST_TUNING_SEED, Setting
+
+PEN, DOOR, REACH = (Cell(task, "uca_flow", 0) for task in ("adroit/pen", "adroit/door", "metaworld/reach"))
+
+
+def test_the_papers_training_lengths():
+    """1000 and 3000 epochs of 2000, 1000 and 500 windows at batch 128, evaluated every 200 epochs."""
+    paper = Setting.load("paper")
+    for cell, frames, epochs in ((REACH, 2000, 1000), (DOOR, 1000, 3000), (PEN, 500, 3000)):
+        batches = -(-frames // 128)
+        assert paper.length(cell).steps == epochs * batches
+        assert paper.length(cell).interval == 200 * batches
+    assert paper.batch_size == 128
+    assert paper.policy_options("uca_flow") == {"type": "uca_flow"}
+
+
+@pytest.mark.parametrize("name", ["paper", "small"])
+def test_a_setting_of_the_package_trains_every_task_and_policy(name):
+    setting = Setting.load(name)
+    assert all(setting.length(Cell(task, "uca_flow", 0)).steps for task in SUITES["all"])
+    options = {policy: setting.policy_options(policy) for policy in POLICIES}
+    assert len({str(each) for each in options.values()}) == len(POLICIES)
+    assert options["adaln"]["conditioning"] == "adaln"
+    assert options["without_dual_pass"]["dual_pass"] is False
+
+
+def test_no_episode_is_used_twice():
+    """Not by two evaluations, not by demonstrations, LeRobot's evaluations or the choice of a setting."""
+    setting = Setting.load("small")
+    tuning = REACH._replace(seed=FIRST_TUNING_SEED)
+    used = [range(1000, 2000), range(1_000_000, 1_100_000)]
+    for cell in (REACH, tuning):
+        used += [setting.interim_seeds(cell, index) for index in range(15)]
+        used.append(setting.final_seeds(cell))
+    assert all(set(first).isdisjoint(second) for first, second in combinations(used, 2))
+
+
+def test_policies_and_training_seeds_see_the_same_episodes():
+    setting = Setting.load("small")
+    other = REACH._replace(policy="dp3", seed=2)
+    assert setting.final_seeds(REACH) == setting.final_seeds(other)
+    assert setting.interim_seeds(REACH, 3) == setting.interim_seeds(other, 3)
+
+
+GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 4, "evaluations": 2}}}
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ("text", "may hold description, batch_size,"),
+        ({**GOOD, "batchsize": 8}, "may hold description, batch_size"),
+        ({"batch_size": 8}, "is not complete"),
+        ({**GOOD, "batch_size": 0}, "batch_size must be a whole number above 0, got 0"),
+        ({**GOOD, "lengths": {"metaworld": {"steps": 5, "evaluations": 2}}}, "must be a multiple of its evaluations"),
+        (
+            {**GOOD, "policies": {"uca": {}}},
+            "policies holds options by type (dp3, flowpolicy, mp1, simple_dp3, uca_flow",
+        ),
+    ],
+)
+def test_a_wrong_file(tmp_path, values, message):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(values))
+    with pytest.raises(UserError) as caught:
+        Setting.load(str(path))
+    assert "'mine'" in str(caught.value)
+    assert message in str(caught.value)
+
+
+def test_an_unknown_setting():
+    with pytest.raises(UserError, match=r"Unknown setting 'big'. Settings: paper, small, or a YAML file's path."):
+        Setting.load("big")
+
+
+def test_a_task_without_length(tmp_path):
+    setting = Setting.from_values("mine", GOOD)
+    with pytest.raises(UserError, match="Setting 'mine' has no length for adroit/pen: lengths of metaworld"):
+        setting.length(PEN)
