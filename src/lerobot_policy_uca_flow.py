@@ -22,6 +22,7 @@ for _part in (
     "policies.configuration_flowpolicy",
     "policies.configuration_mp1",
     "envs.configs",
+    "robots.ur5e.config_ur5e_follower",
 ):
     _load(_part)
 

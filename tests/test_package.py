@@ -86,6 +86,8 @@ register_third_party_plugins()
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.datasets import factory
+from lerobot.robots import RobotConfig
+assert "ur5e_follower" in RobotConfig.get_known_choices()
 assert {"uca_flow", "dp3", "simple_dp3", "flowpolicy", "mp1"} <= set(PreTrainedConfig.get_known_choices())
 assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
 assert hasattr(factory.LeRobotDataset, "__getitems__")

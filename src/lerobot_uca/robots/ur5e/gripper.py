@@ -1,0 +1,110 @@
+"""A Robotiq gripper behind its URCap's socket on the controller, port 63352."""
+
+import contextlib
+import logging
+import socket
+import threading
+import time
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.robots.ur5e.channel import ArmStoppedError
+
+PORT = 63352
+TIMEOUT = 2.0  # [s]
+ACTIVATION_TIMEOUT = 10.0  # [s]; the fingers move through their whole range meanwhile
+OPEN_COUNT, CLOSED_COUNT = 3, 230  # where a 2F-85's fingers end, of 0 to 255
+
+logger = logging.getLogger(__name__)
+
+
+class RobotiqGripper:
+    """Positions in [0, 1]: 0 open, 1 closed. Its answers take milliseconds, so a thread of its own waits for them."""
+
+    def __init__(self, ip: str) -> None:
+        try:
+            self._connection = socket.create_connection((ip, PORT), timeout=TIMEOUT)
+        except OSError as error:
+            raise UserError(
+                f"No gripper answers at {ip}:{PORT} ({error.strerror or error}): is Robotiq's URCap installed? An arm "
+                "without a gripper has --robot.gripper=none."
+            ) from None
+        self._lock = threading.Lock()
+        self._failure: str | None = None
+        self._position, self._heard_at = 0.0, time.monotonic()
+        self._requested: int | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="gripper", daemon=True)
+        try:
+            self._activate()
+            self._position = self._read_position()
+        except BaseException:
+            self._connection.close()
+            raise
+        self._thread.start()
+
+    def _ask(self, request: str) -> str:
+        self._connection.sendall(f"{request}\n".encode("ascii"))
+        return self._connection.recv(1024).decode("ascii", errors="replace").strip()
+
+    def _get(self, name: str) -> int:
+        answer = self._ask(f"GET {name}")
+        if not answer.removeprefix(f"{name} ").isdigit():
+            raise ArmStoppedError(f"The gripper has no value for {name} ('{answer}'): emergency stop, or not wired.")
+        return int(answer.removeprefix(f"{name} "))
+
+    def _activate(self) -> None:
+        if self._get("STA") != 3:
+            logger.info("The gripper is activated: its fingers open and close once.")
+            for request in ("SET ACT 0", "SET ATR 0", "SET ACT 1"):
+                self._ask(request)
+            deadline = time.monotonic() + ACTIVATION_TIMEOUT
+            while self._get("STA") != 3:
+                if time.monotonic() > deadline:
+                    raise UserError(f"The gripper did not become active within {ACTIVATION_TIMEOUT:.0f} s.")
+                time.sleep(0.05)
+        if fault := self._get("FLT"):
+            raise UserError(f"The gripper reports fault {fault}: see Robotiq's manual, and reset it on the pendant.")
+
+    def _read_position(self) -> float:
+        share = (self._get("POS") - OPEN_COUNT) / (CLOSED_COUNT - OPEN_COUNT)
+        return min(max(share, 0.0), 1.0)
+
+    def _run(self) -> None:
+        sent: int | None = None
+        try:
+            while not self._closing.is_set():
+                with self._lock:
+                    requested = self._requested
+                if requested != sent:
+                    self._ask(f"SET POS {requested} SPE 255 FOR 50 GTO 1")
+                    sent = requested
+                position = self._read_position()
+                with self._lock:
+                    self._position, self._heard_at = position, time.monotonic()
+                self._closing.wait(0.005)
+        except (OSError, ArmStoppedError) as error:
+            with self._lock:
+                self._failure = str(error) or type(error).__name__
+
+    @property
+    def position(self) -> float:
+        """Measured. Raises `ArmStoppedError` where the gripper no longer answers."""
+        with self._lock:
+            if self._failure is not None or time.monotonic() - self._heard_at > TIMEOUT:
+                raise ArmStoppedError(f"The gripper no longer answers ({self._failure or 'no data'}).")
+            return self._position
+
+    def request(self, position: float) -> float:
+        """Go to a position; what is commanded is returned: the nearest that the gripper can tell apart."""
+        share = min(max(position, 0.0), 1.0)
+        count = round(OPEN_COUNT + share * (CLOSED_COUNT - OPEN_COUNT))
+        with self._lock:
+            self._requested = count
+        return (count - OPEN_COUNT) / (CLOSED_COUNT - OPEN_COUNT)
+
+    def close(self) -> None:
+        """Hang up. The fingers stay where they are."""
+        self._closing.set()
+        self._thread.join(TIMEOUT)
+        with contextlib.suppress(OSError):
+            self._connection.close()

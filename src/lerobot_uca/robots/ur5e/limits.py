@@ -1,0 +1,92 @@
+"""Limits of what an arm is told to do. Pure functions of joint angles q [rad] and velocities qd [rad/s], (6,)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_uca.robots.ur5e.kinematics import Array
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """What holds for every caller."""
+
+    lower: tuple[float, ...]  # (6,) [rad]
+    upper: tuple[float, ...]  # (6,) [rad]
+    velocity: float  # [rad/s], of each joint
+    acceleration: float  # [rad/s^2], of each joint
+    step: float  # [rad], from one target to the next, of each joint
+
+
+def clip_target(target: Array, previous: Array, limits: JointLimits, elapsed: float) -> Array:
+    """The nearest target that is allowed.
+
+    Inside the joint range, and from the previous target no farther away than `step` nor than the velocity limit reaches
+    in the time between the two. All joints are shortened alike: the direction stays.
+
+    Args:
+        target: wanted, (6,).
+        previous: what was commanded before, (6,).
+        limits: to hold.
+        elapsed: time between the two [s].
+    """
+    inside = np.clip(target, limits.lower, limits.upper)
+    way = inside - previous
+    longest = np.abs(way).max()
+    allowed = min(limits.step, limits.velocity * elapsed)
+    return inside if longest <= allowed else previous + way * (allowed / longest)
+
+
+def step_towards(q: Array, qd: Array, target: Array, limits: JointLimits, dt: float) -> tuple[Array, Array]:
+    """The state a time dt later of joints that reach a target soonest and stop there, within the limits.
+
+    Joints move independently of one another. They never pass a target that does not move.
+    """
+    a = limits.acceleration
+    way, distance = target - q, np.abs(target - q)
+    # The speed from which braking by `a dt` in every step ends at the target and not behind it; the last step arrives.
+    braking = np.maximum(a * (np.sqrt(2 * distance / a) - dt / 2), np.minimum(distance / dt, a * dt))
+    wanted = np.sign(way) * np.minimum(limits.velocity, braking)
+    qd = np.clip(wanted, qd - a * dt, qd + a * dt)
+    return q + qd * dt, qd
+
+
+class Interpolator:
+    """Makes a smooth path of targets that come seldom: the servo loop's setpoints.
+
+    A reference moves straight from where it is to the newest target in that target's duration; the setpoint follows the
+    reference within the limits. It lags behind by about velocity / (2 acceleration), and never overshoots a target
+    that stays.
+    """
+
+    def __init__(self, q: Array, limits: JointLimits) -> None:
+        self._limits = limits
+        self.reset(q)
+
+    def reset(self, q: Array) -> None:
+        """Stand still at q."""
+        self.q: Array = np.array(q, dtype=np.float64)
+        self.qd: Array = np.zeros(6)
+        self._start = self._target = self.q
+        self._elapsed, self._duration = 0.0, 1.0
+
+    def set_target(self, target: Array, duration: float) -> None:
+        """Go there, in that time [s] if the limits allow it. The joint range is held here, too."""
+        self._start = self._reference()
+        self._target = np.clip(target, self._limits.lower, self._limits.upper)
+        self._elapsed, self._duration = 0.0, duration
+
+    def _reference(self) -> Array:
+        share = min(1.0, self._elapsed / self._duration)
+        return self._start + share * (self._target - self._start)
+
+    @property
+    def has_arrived(self) -> bool:
+        """Whether the setpoint is where the target is."""
+        return bool(np.abs(self._target - self.q).max() < 1e-6)
+
+    def step(self, dt: float) -> Array:
+        """The setpoint (6,) a time dt later."""
+        self._elapsed += dt
+        self.q, self.qd = step_towards(self.q, self.qd, self._reference(), self._limits, dt)
+        return self.q

@@ -1,0 +1,205 @@
+"""The process that talks to the arm. `RtdeProcess` starts it; it ends with the driver's process, whatever ends that.
+
+ur_rtde runs here and nowhere else. Of its release 1.6.5 this was measured: it dies of a segmentation fault when
+RTDE's stream breaks while the controller still accepts connections; `servoJ` answers True while the arm is stopped or
+gone and takes targets that are no numbers or too few; its getters repeat the last values for ever. So this loop checks
+connection, age of the data, program and safety before every command, sends checked targets only, and leaves at once,
+without ur_rtde's own cleaning up, where something is wrong.
+"""
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from lerobot_uca.robots.ur5e.channel import (
+    ArmStoppedError,
+    Failure,
+    Message,
+    Note,
+    Settings,
+    State,
+    Stop,
+    Target,
+    decode,
+    encode,
+)
+from lerobot_uca.robots.ur5e.limits import Interpolator
+
+FREEZE_AFTER, STALE_AFTER = 0.1, 0.5  # [s] without new data from the controller
+WATCHDOG_RATE = 2.0  # [Hz]: the controller ends the program of a client that has been silent for half a second
+BRAKING = 4.0  # [rad/s^2], of servoStop
+
+
+class Channel:
+    """The driver's side of the process, without ever waiting for it."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._socket = socket.socket(fileno=descriptor)
+        self._received = b""
+
+    def receive(self) -> list[Message]:
+        """What has come. A driver that is gone is a `Stop`."""
+        self._socket.setblocking(False)
+        try:
+            while data := self._socket.recv(65536):
+                self._received += data
+            return [Stop()]
+        except BlockingIOError:
+            pass
+        except OSError:
+            return [Stop()]
+        *lines, self._received = self._received.split(b"\n")
+        return [decode(line) for line in lines]
+
+    def receive_settings(self) -> Settings:
+        """The first message; waits for it."""
+        while True:
+            for message in self.receive():
+                if isinstance(message, Settings):
+                    return message
+                if isinstance(message, Stop):
+                    sys.exit(0)
+            time.sleep(0.005)
+
+    def send(self, message: Message) -> None:
+        """A state is left out where the driver does not read; anything else waits for a second."""
+        self._socket.settimeout(0 if isinstance(message, State) else 1)
+        with contextlib.suppress(OSError):
+            self._socket.sendall(encode(message))
+
+
+class ServoLoop:
+    """Streams setpoints to the arm at a constant rate and watches over it."""
+
+    def __init__(self, settings: Settings, channel: Channel) -> None:
+        from rtde_control import RTDEControlInterface
+        from rtde_receive import RTDEReceiveInterface
+
+        self._settings, self._channel = settings, channel
+        self._period = 1 / settings.servo_rate
+        self._receive: Any = RTDEReceiveInterface(settings.ip, settings.servo_rate)
+        self._control: Any = RTDEControlInterface(settings.ip, settings.servo_rate)
+        self._timestamp, self._changed_at = -1.0, time.monotonic()
+        self._interpolator = Interpolator(np.array(self._receive.getActualQ()), settings.limits)
+        self._is_servoing = False
+        self._idle_since = time.monotonic()
+        self._control.setWatchdog(WATCHDOG_RATE)
+
+    def run(self) -> None:
+        """Until the driver says stop or is gone. Raises `ArmStoppedError` where the arm cannot go on."""
+        due = time.monotonic()
+        while True:
+            self._check()
+            for message in self._channel.receive():
+                if isinstance(message, Stop):
+                    return
+                if isinstance(message, Target):
+                    self._accept(message)
+            if os.getppid() != self._settings.parent:  # a process forked by the driver may hold the channel open
+                return
+            self._command()
+            self._channel.send(self._state())
+            due = max(due + self._period, time.monotonic() - self._period)
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def _check(self) -> None:
+        receive, ip = self._receive, self._settings.ip
+        if not receive.isConnected() or not self._control.isConnected():
+            raise ArmStoppedError(f"The connection to {ip} is lost (robot switched off, cable, network).")
+        if (timestamp := receive.getTimestamp()) != self._timestamp:
+            self._timestamp, self._changed_at = timestamp, time.monotonic()
+        if self._age > STALE_AFTER:
+            raise ArmStoppedError(f"No data from {ip} for {self._age:.1f} s: the arm's state is unknown.")
+        if receive.isEmergencyStopped():
+            raise ArmStoppedError("Emergency stop: release the button, power on on the pendant, start again.")
+        if receive.isProtectiveStopped():
+            raise ArmStoppedError(
+                "Protective stop: the arm met something or was to leave its limits. Find the cause, unlock it on the "
+                "pendant (after 5 s), start again."
+            )
+        if not self._control.isProgramRunning():
+            raise ArmStoppedError("The program on the controller was stopped: on the pendant, or by another client.")
+
+    @property
+    def _age(self) -> float:
+        return time.monotonic() - self._changed_at
+
+    def _accept(self, target: Target) -> None:
+        q = np.array(target.q, dtype=np.float64)
+        if q.shape != (6,) or not np.isfinite(q).all() or not target.duration > 0:
+            raise ArmStoppedError(f"A target has six finite angles and a positive duration, got {target}.")
+        if not self._is_servoing:
+            self._interpolator.reset(np.array(self._receive.getActualQ()))
+            self._is_servoing = True
+        self._interpolator.set_target(q, target.duration)
+        self._idle_since = time.monotonic() + target.duration
+
+    def _command(self) -> None:
+        idle = time.monotonic() - self._idle_since
+        if self._is_servoing and self._interpolator.has_arrived and idle > self._settings.stop_after:
+            self.brake()
+            self._channel.send(Note(f"No action for {idle:.1f} s: the arm has stopped, the next action eases in."))
+        if not self._is_servoing:
+            self._control.kickWatchdog()
+            return
+        q = self._interpolator.q if self._age > FREEZE_AFTER else self._interpolator.step(self._period)
+        settings = self._settings
+        if not self._control.servoJ(q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain):
+            raise ArmStoppedError("The controller did not take a target: its program is not running.")
+
+    def _state(self) -> State:
+        receive = self._receive
+        return State(
+            timestamp=self._timestamp,
+            q=receive.getActualQ(),
+            qd=receive.getActualQd(),
+            tcp=receive.getActualTCPPose(),
+            setpoint=tuple(self._interpolator.q.tolist()),
+            is_servoing=self._is_servoing,
+            has_arrived=self._interpolator.has_arrived,
+        )
+
+    def brake(self) -> None:
+        """Stand still, and stay so."""
+        self._is_servoing = False
+        self._control.servoStop(BRAKING)
+
+    def end(self) -> None:
+        """Brake and end the program, if the arm can still be reached; otherwise its own watchdog does."""
+        receive, control = self._receive, self._control
+        reached = receive.isConnected() and control.isConnected() and self._age < STALE_AFTER
+        if reached and control.isProgramRunning():
+            self.brake()
+            control.stopScript()
+
+
+def main() -> None:
+    """Runs until the driver stops it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the driver, which then stops the arm in order
+    channel = Channel(int(sys.argv[1]))
+    loop = None
+    failure: Failure | None = None
+    try:
+        loop = ServoLoop(channel.receive_settings(), channel)
+        loop.run()
+    except ArmStoppedError as error:
+        failure = Failure(str(error))
+    except Exception as error:  # noqa: BLE001  (ur_rtde's own errors are RuntimeErrors of any text)
+        failure = Failure(f"{type(error).__name__}: {error}")
+    finally:
+        if failure is not None:
+            channel.send(failure)
+        if loop is not None:
+            with contextlib.suppress(Exception):
+                loop.end()
+        os._exit(0)  # ur_rtde's threads and destructors may hang or crash
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,269 @@
+"""The UR5e as a LeRobot robot."""
+
+import logging
+import math
+import os
+import time
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from lerobot.cameras import make_cameras_from_configs
+from lerobot.lerobot_types import RobotAction, RobotObservation
+from lerobot.robots import Robot
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Settings, State, Target
+from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
+from lerobot_uca.robots.ur5e.dashboard import check_controller
+from lerobot_uca.robots.ur5e.gripper import RobotiqGripper
+from lerobot_uca.robots.ur5e.kinematics import (
+    JOINTS,
+    Array,
+    flange_pose,
+    inverse_kinematics,
+    pose_from_vector,
+    pose_to_vector,
+)
+from lerobot_uca.robots.ur5e.limits import clip_target
+from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
+
+# LeRobot's rollout hands a policy what ends in `.pos`, and nothing else.
+JOINT_KEYS = tuple(f"{joint}.pos" for joint in JOINTS)
+TCP_KEYS = tuple(f"tcp_{axis}.pos" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+GRIPPER_KEY = "gripper.pos"
+
+MEANT_IN_RADIANS = 2 * math.pi + 1.0
+NOTICEABLE = 1e-3  # [rad]: what is clipped by less is not worth a line
+
+logger = logging.getLogger(__name__)
+
+
+class UR5eFollower(Robot):
+    """Six joints, a gripper, cameras. The arm is driven by a process of its own, see `rtde_client`."""
+
+    config_class = UR5eFollowerConfig
+    name = "ur5e_follower"
+
+    def __init__(self, config: UR5eFollowerConfig) -> None:
+        config.check()
+        super().__init__(config)
+        self.config = config
+        self.cameras: dict[str, Any] = make_cameras_from_configs(config.cameras)
+        self._arm: RtdeProcess | None = None
+        self._gripper: RobotiqGripper | None = None
+        self._previous: Array = np.zeros(6)  # the last target [rad]
+        self._sent_at = 0.0
+        self._tcp_near: Array = np.zeros(6)
+        self._clipping = ClippingReport()
+
+    @cached_property
+    def _keys(self) -> tuple[str, ...]:
+        """Of states and actions alike."""
+        keys = JOINT_KEYS if self.config.action == "joints" else TCP_KEYS
+        return keys if self.config.gripper == "none" else (*keys, GRIPPER_KEY)
+
+    @cached_property
+    def observation_features(self) -> dict[str, type | tuple[int, ...]]:
+        """Position keys and pictures, also while disconnected."""
+        features: dict[str, type | tuple[int, ...]] = dict.fromkeys(self._keys, float)
+        for name, camera in self.cameras.items():
+            if getattr(camera, "use_rgb", True):
+                features[name] = (camera.height, camera.width, 3)
+            if getattr(camera, "use_depth", False):
+                features[f"{name}_depth"] = (camera.height, camera.width, 1)
+        return features
+
+    @cached_property
+    def action_features(self) -> dict[str, type]:
+        """Position keys, also while disconnected."""
+        return dict.fromkeys(self._keys, float)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether `connect` has succeeded, until `disconnect`; an arm that has stopped says so when it is used."""
+        return self._arm is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        """The arm's encoders are absolute."""
+        return True
+
+    def calibrate(self) -> None:
+        """The arm's encoders are absolute."""
+
+    def configure(self) -> None:
+        """Everything is given when the arm is connected."""
+
+    @check_if_already_connected
+    def connect(self, calibrate: bool = True) -> None:
+        """Check the controller, start the arm's process, the gripper and the cameras. Nothing moves but the gripper."""
+        del calibrate
+        config = self.config
+        check_controller(config.ip)
+        settings = Settings(
+            ip=config.ip,
+            parent=os.getpid(),
+            limits=config.limits,
+            servo_rate=config.servo_rate,
+            lookahead=config.servo_lookahead,
+            gain=config.servo_gain,
+            stop_after=config.stop_after,
+        )
+        self._arm = RtdeProcess(settings)
+        try:
+            self._tcp_near = np.array(self._arm.state().tcp)
+            if config.gripper == "robotiq":
+                self._gripper = RobotiqGripper(config.ip)
+            for camera in self.cameras.values():
+                camera.connect()
+        except BaseException:
+            self.disconnect()
+            raise
+        logger.info("%s connected to %s.", self, config.ip)
+
+    @check_if_not_connected
+    def get_observation(self) -> RobotObservation:
+        """Measured positions and the cameras' newest frames. Raises `ArmStoppedError`; the arm then stands still."""
+        assert self._arm is not None
+        state = self._arm.state()
+        if self.config.action == "joints":
+            values = np.array(state.q)
+        else:
+            values = self._tcp_near = pose_to_vector(pose_from_vector(state.tcp), near=self._tcp_near)
+        observation: RobotObservation = dict(zip(self._keys, values.tolist(), strict=False))
+        if self._gripper is not None:
+            observation[GRIPPER_KEY] = self._gripper.position
+        for name, camera in self.cameras.items():
+            try:
+                if getattr(camera, "use_rgb", True):
+                    observation[name] = camera.read_latest()
+                if getattr(camera, "use_depth", False):
+                    observation[f"{name}_depth"] = camera.read_latest_depth()
+            except (TimeoutError, RuntimeError, ConnectionError) as error:
+                self._arm.stop()
+                raise ArmStoppedError(f"Camera '{name}' gives no pictures ({error}); the arm was stopped.") from error
+        return observation
+
+    @check_if_not_connected
+    def send_action(self, action: RobotAction) -> RobotAction:
+        """Command the arm, and return what was really commanded.
+
+        The first action, and the first one after a pause, is approached slowly, and the call returns when the arm is
+        there. After that targets are clipped: to the joint range, in step and velocity.
+        """
+        assert self._arm is not None
+        values = self._checked(action)
+        state = self._arm.state()
+        if not state.is_servoing:
+            self._previous = np.array(state.q)
+        wanted = self._joint_target(values[:6], state)
+        commanded_gripper = [] if self._gripper is None else [self._gripper.request(values[6])]
+        if state.is_servoing:
+            elapsed = min(time.monotonic() - self._sent_at, self.config.stop_after)
+            target = clip_target(wanted, self._previous, self.config.limits, max(elapsed, 1 / self.config.control_rate))
+            self._clipping.note(wanted - target)
+            self._arm.send(Target(tuple(target.tolist()), 1 / self.config.control_rate))
+        else:
+            target = np.clip(wanted, self.config.lower, self.config.upper)
+            self._clipping.note(wanted - target)
+            self._ease(target)
+        self._previous, self._sent_at = target, time.monotonic()
+        commanded = target if self.config.action == "joints" else self._tcp_at(target, state)
+        return dict(zip(self._keys, [*commanded.tolist(), *commanded_gripper], strict=True))
+
+    def _checked(self, action: RobotAction) -> Array:
+        """The action's values in the order of the keys."""
+        if set(action) != set(self._keys):
+            missing, unknown = sorted(set(self._keys) - set(action)), sorted(set(action) - set(self._keys))
+            raise UserError(
+                f"An action of {self.name} has the names {', '.join(self._keys)}; missing: "
+                f"{', '.join(missing) or '-'}; unknown: {', '.join(unknown) or '-'}. "
+                "Is the dataset or the policy another robot's?"
+            )
+        values = np.array([float(action[key]) for key in self._keys])  # replay hands over tensors without dimensions
+        if not np.isfinite(values).all():
+            bad = ", ".join(key for key, value in zip(self._keys, values, strict=True) if not math.isfinite(value))
+            raise UserError(f"An action's values are finite numbers, got others for {bad}; the arm holds its position.")
+        if self.config.action == "joints" and (largest := np.abs(values[:6]).max()) > MEANT_IN_RADIANS:
+            raise UserError(f"Joint actions are angles in radians, within 2 pi of zero, got {largest:.1f}. Degrees?")
+        return values
+
+    def _joint_target(self, values: Array, state: State) -> Array:
+        """The joint angles (6,) that an action means."""
+        if self.config.action == "joints":
+            return values
+        flange = pose_from_vector(values) @ np.linalg.inv(_tool(state))
+        q = inverse_kinematics(flange, self._previous)
+        if q is None:
+            self._clipping.note_unreachable(values)
+            return self._previous
+        return q
+
+    def _tcp_at(self, q: Array, state: State) -> Array:
+        return pose_to_vector(flange_pose(q) @ _tool(state), near=self._tcp_near)
+
+    def _ease(self, target: Array) -> None:
+        """Go to a target slowly and wait for it."""
+        assert self._arm is not None
+        distance = np.abs(target - self._previous).max()
+        duration = max(distance / self.config.ease_velocity, 1 / self.config.control_rate)
+        if distance > self.config.max_step:
+            joint = JOINTS[int(np.abs(target - self._previous).argmax())]
+            logger.warning("The first target is %.2f rad away (%s): easing there in %.0f s.", distance, joint, duration)
+        self._arm.send(Target(tuple(target.tolist()), duration))
+
+        def has_arrived(state: State | None) -> bool:
+            return state is not None and state.is_servoing and np.abs(np.array(state.setpoint) - target).max() < 1e-4
+
+        self._arm.wait_for(has_arrived, 2 * duration + 5, "The pose of the first action")
+
+    def disconnect(self) -> None:
+        """The arm brakes and stands still; its program ends."""
+        if self._arm is not None:
+            self._arm.stop()
+            self._arm = None
+        if self._gripper is not None:
+            self._gripper.close()
+            self._gripper = None
+        for camera in self.cameras.values():
+            if camera.is_connected:
+                camera.disconnect()
+
+
+def _tool(state: State) -> Array:
+    """T_flange_tcp, (4, 4), as it is where the arm stands.
+
+    So measured, it holds the tool's pose and this arm's own deviation from the nominal kinematics, exact where the arm
+    is going as it gets there.
+    """
+    return np.linalg.inv(flange_pose(state.q)) @ pose_from_vector(state.tcp)
+
+
+class ClippingReport:
+    """Says how much of the targets the limits have taken away, once a second: datasets hold the unclipped ones."""
+
+    def __init__(self, every: float = 1.0) -> None:
+        self._every = every
+        self._due = -math.inf
+        self._largest = np.zeros(6)
+        self._n = 0
+
+    def note(self, clipped: Array) -> None:
+        """What was taken away from a target, (6,) [rad]."""
+        if np.abs(clipped).max() > NOTICEABLE:
+            self._n += 1
+            self._largest = np.maximum(self._largest, np.abs(clipped))
+        if self._n and time.monotonic() >= self._due:
+            joint = int(self._largest.argmax())
+            logger.warning(
+                "%d targets were clipped, by up to %.3f rad (%s).", self._n, self._largest[joint], JOINTS[joint]
+            )
+            self._due, self._largest, self._n = time.monotonic() + self._every, np.zeros(6), 0
+
+    def note_unreachable(self, pose: Array) -> None:
+        """A pose that the arm cannot take."""
+        if time.monotonic() >= self._due:
+            logger.warning("The pose %s cannot be reached; the arm holds its position.", np.round(pose[:6], 3).tolist())
+            self._due = time.monotonic() + self._every

@@ -1,0 +1,70 @@
+import numpy as np
+import pytest
+
+from lerobot_uca.robots.ur5e.limits import Interpolator, JointLimits, clip_target, step_towards
+
+LIMITS = JointLimits(lower=(-1.0,) * 6, upper=(1.0,) * 6, velocity=0.8, acceleration=4.0, step=0.2)
+REST = np.zeros(6)
+DT = 0.008
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_stream_of_targets_breaks_a_limit(seed):
+    rng = np.random.default_rng(seed)
+    interpolator = Interpolator(REST, LIMITS)
+    path = [REST]
+    for _ in range(150):
+        interpolator.set_target(rng.uniform(-3, 3, 6), duration=rng.choice([0.001, 0.03, 0.5]))
+        path += [interpolator.step(DT).copy() for _ in range(rng.integers(1, 60))]
+    velocity = np.diff(path, axis=0) / DT
+    assert np.abs(path).max() <= 1.0 + 1e-12
+    assert np.abs(velocity).max() <= LIMITS.velocity + 1e-9
+    assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration * DT + 1e-9
+
+
+def test_joints_arrive_stop_and_never_pass_the_target():
+    target = np.array([0.5, -0.5, 0.1, 0.001, 0.0, 0.9])
+    q, qd = REST, REST
+    for _ in range(400):
+        q, qd = step_towards(q, qd, target, LIMITS, DT)
+        assert np.all(np.abs(q) <= np.abs(target) + 1e-12)
+    np.testing.assert_allclose(q, target, atol=1e-9)
+    np.testing.assert_allclose(qd, 0, atol=1e-9)
+
+
+def test_the_time_optimal_motion_takes_the_time_it_must():
+    q, qd, n = REST, REST, 0
+    while np.abs(q - 0.8).max() > 1e-6:
+        q, qd = step_towards(q, qd, np.full(6, 0.8), LIMITS, DT)
+        n += 1
+    assert n * DT == pytest.approx(0.8 / 0.8 + 0.8 / 4.0, abs=0.03)  # way / v + v / a
+
+
+def test_a_steady_stream_is_followed_smoothly():
+    """30 targets a second along a line: no stop and go between them, and the documented lag."""
+    interpolator = Interpolator(REST, LIMITS)
+    velocity, path = 0.4, []
+    for step in range(1, 60):
+        interpolator.set_target(np.full(6, velocity * step / 30), duration=1 / 30)
+        path += [interpolator.step(1 / 240).copy() for _ in range(8)]
+    speeds = np.diff(path, axis=0)[120:] * 240
+    np.testing.assert_allclose(speeds, velocity, rtol=0.02)
+    lag = velocity * 59 / 30 - interpolator.q
+    np.testing.assert_allclose(lag, velocity**2 / (2 * LIMITS.acceleration), atol=0.003)
+
+
+def test_a_target_inside_the_limits_is_untouched():
+    target = np.array([0.02, -0.01, 0, 0, 0, 0])
+    np.testing.assert_array_equal(clip_target(target, REST, LIMITS, elapsed=1 / 30), target)
+
+
+def test_a_target_outside_the_range_ends_at_its_edge():
+    previous = np.full(6, 0.99)
+    np.testing.assert_allclose(clip_target(np.full(6, 1.5), previous, LIMITS, elapsed=1.0), 1.0)
+
+
+@pytest.mark.parametrize(("elapsed", "allowed"), [(0.1, 0.08), (10.0, 0.2)], ids=["velocity", "step"])
+def test_a_target_too_far_away_is_shortened_in_its_direction(elapsed, allowed):
+    wanted = np.array([0.8, -0.4, 0.2, 0, 0, 0])
+    target = clip_target(wanted, REST, LIMITS, elapsed)
+    np.testing.assert_allclose(target, wanted * (allowed / 0.8))

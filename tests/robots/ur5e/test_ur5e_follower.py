@@ -1,0 +1,375 @@
+"""The driver with the simulated controller: real sockets, the real client in its process."""
+
+import logging
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from lerobot.robots import RobotConfig, make_robot_from_config
+from lerobot.utils.errors import DeviceNotConnectedError
+from tests.robots.conftest import free_address, wait_until
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.robots.ur5e.channel import ArmStoppedError
+from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
+from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_to_vector
+from lerobot_uca.robots.ur5e.sim.controller import Controller
+from lerobot_uca.robots.ur5e.sim.robot import Runtime
+from lerobot_uca.robots.ur5e.ur5e_follower import GRIPPER_KEY, JOINT_KEYS, TCP_KEYS, ClippingReport, UR5eFollower
+
+pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
+
+HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+
+
+def make_robot(controller, tmp_path, **settings) -> UR5eFollower:
+    config = UR5eFollowerConfig(ip=controller.address, calibration_dir=tmp_path, **settings)
+    return make_robot_from_config(config)
+
+
+@pytest.fixture
+def robot(controller, tmp_path):
+    robot = make_robot(controller, tmp_path)
+    robot.connect()
+    yield robot
+    robot.disconnect()
+
+
+def action_at(q, gripper=0.0) -> dict:
+    return {**dict(zip(JOINT_KEYS, q, strict=True)), GRIPPER_KEY: gripper}
+
+
+def stands_still(controller) -> bool:
+    return np.abs(controller.robot.arm.qd).max() < 1e-6
+
+
+def speed(controller) -> float:
+    return np.abs(controller.robot.arm.qd).max()
+
+
+def stream(robot, velocity, seconds=2.0, rate=30.0):
+    """Joint targets that move at a velocity; the last one."""
+    q = np.array([robot.get_observation()[key] for key in JOINT_KEYS])
+    for _ in range(round(seconds * rate)):
+        q = q + velocity / rate
+        robot.send_action(action_at(q))
+        time.sleep(1 / rate)
+    return q
+
+
+def keep_moving(robot):
+    """Start a motion in the background; the error that ends it arrives in the list."""
+    errors = []
+
+    def run():
+        try:
+            stream(robot, 0.3, seconds=30)
+        except (UserError, DeviceNotConnectedError) as error:
+            errors.append(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return errors
+
+
+def test_lerobot_makes_the_robot_and_knows_its_features_while_disconnected(tmp_path):
+    config = RobotConfig.get_choice_class("ur5e_follower")(ip="127.0.0.1", calibration_dir=tmp_path)
+    robot = make_robot_from_config(config)
+    assert isinstance(robot, UR5eFollower)
+    assert robot.observation_features == robot.action_features == dict.fromkeys((*JOINT_KEYS, GRIPPER_KEY), float)
+    assert not robot.is_connected
+    config = UR5eFollowerConfig(ip="127.0.0.1", action="tcp", gripper="none", calibration_dir=tmp_path)
+    assert list(make_robot_from_config(config).action_features) == list(TCP_KEYS)
+
+
+def test_actions_are_carried_out(controller, robot):
+    observation = robot.get_observation()
+    np.testing.assert_allclose([observation[key] for key in JOINT_KEYS], HOME, atol=1e-6)
+    assert observation[GRIPPER_KEY] == 0
+    target = HOME + 0.05
+    commanded = robot.send_action(action_at(torch.tensor(target).unbind(), gripper=torch.tensor(0.5)))  # as replay does
+    np.testing.assert_allclose([commanded[key] for key in JOINT_KEYS], target, atol=1e-6)
+    assert commanded[GRIPPER_KEY] == pytest.approx(0.5, abs=1 / 227)
+    wait_until(lambda: np.abs(controller.robot.arm.q - target).max() < 1e-3)
+    wait_until(lambda: abs(robot.get_observation()[GRIPPER_KEY] - commanded[GRIPPER_KEY]) < 0.01)
+
+
+def test_a_stream_is_followed_within_the_tracking_error_of_its_lags(controller, robot):
+    """Interpolation, limits and servoj lag behind by known times; nothing else is lost."""
+    velocity, config = 0.3, robot.config
+    last = stream(robot, velocity, seconds=1.5)
+    lag = 1 / 30 + velocity / (2 * config.max_acceleration) + config.servo_lookahead  # [s]
+    error = np.abs(last - controller.robot.arm.q).max()
+    assert error < velocity * (lag + 0.1)
+    wait_until(lambda: np.abs(last - controller.robot.arm.q).max() < 2e-3)
+
+
+def test_the_first_action_is_eased_to_and_far_ones_are_clipped_and_said(controller, robot, caplog):
+    fastest = [0.0]
+    target = HOME + np.array([0.6, 0, 0, 0, 0, 0])
+    thread = threading.Thread(target=robot.send_action, args=(action_at(target),))
+    thread.start()
+    while thread.is_alive():
+        fastest.append(speed(controller))
+        thread.join(0.01)
+    assert max(fastest) < robot.config.ease_velocity * 1.2
+    assert np.abs(controller.robot.target_q - target).max() < 0.05
+    assert "0.60 rad away (shoulder_pan): easing there" in caplog.text
+    commanded = robot.send_action(action_at(target + 1.0))
+    step = np.array([commanded[key] for key in JOINT_KEYS]) - target
+    assert 0 < step.max() <= robot.config.max_step
+    assert "1 targets were clipped, by up to" in caplog.text
+
+
+def test_velocity_is_limited_whatever_is_asked(controller, robot):
+    robot.send_action(action_at(HOME))
+    fastest = []
+    for step in range(45):  # LeRobot's rollout returns to its start in a fixed time, whatever the distance
+        robot.send_action(action_at(HOME + np.array([0.2 * step, 0, 0, 0, 0, 0]).clip(max=1.5)))
+        fastest.append(speed(controller))
+        time.sleep(1 / 30)
+    assert max(fastest) < robot.config.max_velocity * 1.2
+    assert not controller.robot.stop_reason
+
+
+def test_joint_range_holds(controller, tmp_path):
+    lower, upper = tuple(HOME - 0.1), tuple(HOME + 0.1)
+    robot = make_robot(controller, tmp_path, lower=lower, upper=upper)
+    with robot:
+        commanded = robot.send_action(action_at(HOME + 0.3))
+        np.testing.assert_allclose([commanded[key] for key in JOINT_KEYS], upper)
+
+
+def test_tcp_actions_move_the_tool_in_the_base_frame(controller, tmp_path):
+    robot = make_robot(controller, tmp_path, action="tcp", gripper="none")
+    with robot:
+        start = robot.get_observation()
+        np.testing.assert_allclose(list(start.values()), pose_to_vector(flange_pose(HOME)), atol=1e-6)
+        target = {**start, "tcp_z.pos": start["tcp_z.pos"] - 0.03}
+        commanded = robot.send_action(target)
+        np.testing.assert_allclose(list(commanded.values()), list(target.values()), atol=1e-4)
+        wait_until(lambda: abs(robot.get_observation()["tcp_z.pos"] - target["tcp_z.pos"]) < 1e-3)
+        np.testing.assert_allclose(list(robot.get_observation().values()), list(target.values()), atol=2e-3)
+        held = robot.send_action({**target, "tcp_x.pos": 3.0})  # out of reach
+        np.testing.assert_allclose(list(held.values()), list(commanded.values()), atol=2e-3)
+
+
+def test_without_actions_the_arm_holds_then_stops_and_eases_in_again(controller, tmp_path, caplog):
+    robot = make_robot(controller, tmp_path, stop_after=0.3)
+    with robot:
+        robot.send_action(action_at(HOME + 0.02))
+        wait_until(lambda: "the arm has stopped" in caplog.text)
+        wait_until(lambda: stands_still(controller))
+        assert controller.robot.runtime == Runtime.PLAYING
+        robot.send_action(action_at(HOME))
+        wait_until(lambda: np.abs(controller.robot.arm.q - HOME).max() < 1e-3)
+
+
+STOPS = {
+    "protective stop": lambda controller: controller.robot.protective_stop("a collision"),
+    "emergency stop": lambda controller: controller.robot.emergency_stop(),
+    "program": lambda controller: controller.robot.stop_program(),
+    "no data|connection": lambda controller: setattr(controller.network, "is_silent", True),
+    "connection|ended": lambda controller: controller.vanish(),
+}
+
+
+@pytest.mark.parametrize(("line", "fault"), STOPS.items(), ids=["protective", "emergency", "program", "silent", "gone"])
+def test_a_fault_ends_standing_still_and_in_one_line(controller, robot, line, fault):
+    errors = keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    with controller.robot.lock:
+        fault(controller)
+    wait_until(lambda: errors)
+    wait_until(lambda: stands_still(controller))
+    (error,) = errors
+    assert isinstance(error, ArmStoppedError)
+    assert "\n" not in str(error)
+    assert any(each in str(error).lower() for each in line.split("|")), error
+    with pytest.raises(ArmStoppedError):
+        robot.get_observation()
+
+
+def test_disconnecting_stops_a_moving_arm_and_frees_it(controller, robot, tmp_path):
+    keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    robot.disconnect()
+    wait_until(lambda: stands_still(controller))
+    assert controller.robot.runtime == Runtime.STOPPED
+    with make_robot(controller, tmp_path) as again:
+        assert again.is_connected
+
+
+PARENT = """
+import os, sys, time
+from lerobot_uca.robots.ur5e.channel import Settings, Target
+from lerobot_uca.robots.ur5e.limits import JointLimits
+from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
+limits = JointLimits(lower=(-6.0,) * 6, upper=(6.0,) * 6, velocity=1.0, acceleration=5.0, step=0.2)
+arm = RtdeProcess(Settings(sys.argv[1], os.getpid(), limits, servo_rate=125, lookahead=0.1, gain=300, stop_after=2))
+q = arm.state().q
+if os.fork() == 0:  # as data loaders do: this one keeps the channel open and must not keep the arm going
+    time.sleep(60)
+while arm.state():
+    q = tuple(angle + 0.01 for angle in q)
+    arm.send(Target(q, 1 / 30))
+    print(arm._process.pid, flush=True)
+    time.sleep(1 / 30)
+"""
+
+
+@pytest.mark.parametrize("victim", ["driver", "client"])
+def test_a_killed_process_leaves_the_arm_standing_still(controller, tmp_path, victim):
+    program = [sys.executable, "-c", PARENT, controller.address]
+    with (tmp_path / "errors").open("w") as errors:
+        parent = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=errors, text=True, start_new_session=True)
+    client = int(parent.stdout.readline())
+    wait_until(lambda: speed(controller) > 0.1)
+    os.kill(parent.pid if victim == "driver" else client, signal.SIGKILL)
+    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
+    wait_until(lambda: stands_still(controller))
+    assert not controller.robot.stop_reason
+    parent.wait(20)
+    if victim == "client":
+        assert "has ended (SIGKILL); the arm stands still" in (tmp_path / "errors").read_text()
+    wait_until(lambda: not is_running(client))
+    os.killpg(parent.pid, signal.SIGKILL)  # the forked one
+    parent.stdout.close()
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+BAD_ACTIONS = {
+    "nan": ({JOINT_KEYS[1]: math.nan}, "finite numbers, got others for shoulder_lift.pos"),
+    "infinite": ({GRIPPER_KEY: math.inf}, "got others for gripper.pos"),
+    "degrees": ({JOINT_KEYS[0]: 90.0}, "radians.*got 90.0. Degrees?"),
+    "another robot": ({"elbow_flex.pos": 0.0}, "unknown: elbow_flex.pos"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_ACTIONS.values(), ids=BAD_ACTIONS)
+def test_bad_actions_are_refused_and_move_nothing(controller, robot, change, message):
+    with pytest.raises(UserError, match=message):
+        robot.send_action({**action_at(HOME), **change})
+    with pytest.raises(UserError, match=r"missing: elbow\.pos"):
+        robot.send_action({key: 0.0 for key in robot.action_features if key != "elbow.pos"})
+    np.testing.assert_allclose(controller.robot.arm.q, HOME)
+
+
+BAD_SETTINGS = {
+    "port": ({"ip": "10.0.0.1:30004"}, "address without a port"),
+    "action": ({"action": "pose"}, "one of joints, tcp, got 'pose'"),
+    "gripper": ({"gripper": "hand"}, "one of robotiq, none, got 'hand'"),
+    "gain": ({"servo_gain": 5.0}, "servo_gain lies in 100 to 2000, got 5"),
+    "velocity": ({"max_velocity": 9.0}, "max_velocity lies in 0.01 to 3.14159, got 9"),
+    "nan": ({"max_step": math.nan}, "max_step lies in"),
+    "five joints": ({"lower": (0.0,) * 5}, "six angles"),
+    "degrees": ({"upper": (180.0,) * 6}, "six angles"),
+    "reversed": ({"lower": (0.5,) * 6, "upper": (0.1,) * 6}, "lies below"),
+}
+
+
+@pytest.mark.parametrize(("settings", "message"), BAD_SETTINGS.values(), ids=BAD_SETTINGS)
+def test_bad_settings_are_refused(tmp_path, settings, message):
+    with pytest.raises(UserError, match=message):
+        UR5eFollower(UR5eFollowerConfig(**{"ip": "127.0.0.1", "calibration_dir": tmp_path, **settings}))
+
+
+def test_an_address_at_which_nothing_listens_is_said(tmp_path):
+    robot = UR5eFollower(UR5eFollowerConfig(ip=free_address(), calibration_dir=tmp_path))
+    with pytest.raises(UserError, match="refuses connections to port 29999"):
+        robot.connect()
+
+
+def test_an_address_that_never_answers_takes_the_seconds_that_are_said(tmp_path):
+    """A listener whose queue is full drops what comes: a silent host without a network."""
+    address = free_address()
+    with socket.create_server((address, 29999), backlog=0), socket.create_connection((address, 29999)):
+        robot = UR5eFollower(UR5eFollowerConfig(ip=address, calibration_dir=tmp_path))
+        with pytest.raises(UserError, match=r"\(?3 s"):
+            robot.connect()
+
+
+def test_something_else_on_the_port_is_said(tmp_path):
+    address = free_address()
+    with socket.create_server((address, 29999)) as server:
+
+        def answer():
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(b"220 mail.example.org ESMTP\r\n")
+
+        threading.Thread(target=answer, daemon=True).start()
+        robot = UR5eFollower(UR5eFollowerConfig(ip=address, calibration_dir=tmp_path))
+        with pytest.raises(UserError, match=r"not a dashboard server .*ESMTP"):
+            robot.connect()
+
+
+def test_polyscope_x_is_refused_with_the_reason(tmp_path):
+    with (
+        Controller(address=free_address(), has_dashboard=False) as controller,
+        pytest.raises(UserError, match=r"PolyScope X\. It is not supported, because"),
+    ):
+        make_robot(controller, tmp_path).connect()
+
+
+def test_an_arm_without_a_gripper_is_said(tmp_path):
+    with Controller(address=free_address()) as controller:
+        with pytest.raises(UserError, match=r"--robot\.gripper=none"):
+            make_robot(controller, tmp_path).connect()
+        assert controller.robot.runtime == Runtime.STOPPED
+        with make_robot(controller, tmp_path, gripper="none") as robot:
+            assert list(robot.get_observation()) == list(JOINT_KEYS)
+
+
+def test_a_firmware_that_was_not_tried_is_said_and_works(tmp_path, caplog):
+    with (
+        Controller(address=free_address(), firmware=(5, 19, 0, 1000)) as controller,
+        make_robot(controller, tmp_path, gripper="none"),
+    ):
+        assert "PolyScope 5.19.0 has not been tried with this driver (tried: 5.12)" in caplog.text
+
+
+def test_a_second_client_is_refused(controller, robot, tmp_path):
+    with pytest.raises(UserError, match="another client or the pendant holds the arm"):
+        make_robot(controller, tmp_path).connect()
+
+
+def test_a_stopped_arm_is_refused(controller, tmp_path):
+    with controller.robot.lock:
+        controller.robot.protective_stop("a collision")
+    with pytest.raises(UserError, match="safety status is PROTECTIVE_STOP"):
+        make_robot(controller, tmp_path).connect()
+
+
+def test_local_control_is_refused(controller, tmp_path):
+    controller.dashboard.is_remote = False
+    with pytest.raises(UserError, match="remote control"):
+        make_robot(controller, tmp_path).connect()
+
+
+def test_a_missing_client_names_the_extra(controller, tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"lerobot_policy_uca_flow\[ur5e\]"):
+        make_robot(controller, tmp_path).connect()
+
+
+def test_clipping_is_said_once_a_second(caplog):
+    caplog.set_level(logging.WARNING)
+    report = ClippingReport(every=math.inf)
+    for size in (0.1, 0.3, 0.2):
+        report.note(np.array([0, size, 0, 0, 0, 0]))
+    assert caplog.messages == ["1 targets were clipped, by up to 0.100 rad (shoulder_lift)."]
