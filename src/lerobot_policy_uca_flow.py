@@ -21,6 +21,7 @@ for _part in (
     "policies.configuration_simple_dp3",
     "policies.configuration_flowpolicy",
     "policies.configuration_mp1",
+    "policies.processor_base",
     "envs.configs",
     "robots.ur5e.config_ur5e_follower",
 ):

@@ -1,4 +1,18 @@
 """Names of the features that datasets, environments and policies share, besides LeRobot's own."""
 
+from collections.abc import Iterable
+
 OBS_POINT_CLOUD = "observation.point_cloud"
 """(N, 3) float32 [m], in the frame that the environment or robot states."""
+
+POINT_CLOUD_KEYS = (OBS_POINT_CLOUD, "observation.pointcloud", "observation.pointcloud.xyz")
+"""Keys under which a point cloud is found, in this order: this package's and other plugins'."""
+
+VALID_MASK_SUFFIX = ".valid_mask"
+"""Appended to a cloud's key (without .xyz): which of its points are valid, (N,) bool."""
+
+
+def find_point_cloud(keys: Iterable[str]) -> str | None:
+    """The key of the point cloud among these, if there is one."""
+    known = set(keys)
+    return next((key for key in POINT_CLOUD_KEYS if key in known), None)

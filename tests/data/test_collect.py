@@ -2,10 +2,12 @@ import dataclasses
 import gc
 import re
 import shutil
+from functools import partial
 from itertools import islice
 
 import numpy as np
 import pytest
+import torch
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -53,6 +55,15 @@ def collected_env():
 def test_statistics_are_per_channel(collected):
     for statistic in ("min", "max"):
         assert collected.meta.stats[OBS_POINT_CLOUD][statistic].shape == (3,)
+
+
+def test_the_dataset_is_the_same_without_progress_bars(collected, tmp_path, monkeypatch):
+    monkeypatch.setattr(collecting, "tqdm", partial(collecting.tqdm, disable=True))  # as with TQDM_DISABLE=1
+    other = collect(config(tmp_path / "drawer"))
+    assert other.num_frames == collected.num_frames
+    for index in (0, 100, 199):
+        for key, value in collected[index].items():
+            assert value == other[index][key] if isinstance(value, str) else torch.equal(value, other[index][key])
 
 
 def test_nothing_but_the_dataset_is_left(collected):

@@ -123,7 +123,7 @@ def _collect_task(
     description = env_config.task_description(task)
     attempts = islice(attempts, MAX_ATTEMPTS * n_episodes)
     episodes = demonstrations(env_config.env_factory(task), attempts, n_wanted=n_episodes)
-    n_tried = 0
+    n_tried = n_kept = 0
     bar = tqdm(total=n_episodes, desc=f"Demonstrations of {task}", unit="episode")
     with closing(episodes), bar as progress:
         for n_tried, episode in enumerate(episodes, start=1):
@@ -134,11 +134,12 @@ def _collect_task(
                     )
                 with SuppressProgressBars():
                     dataset.save_episode()
+                n_kept += 1
                 progress.update()
             progress.set_postfix(tried=n_tried)
-        if progress.n < n_episodes:
+        if n_kept < n_episodes:  # not progress.n, which stands still where bars are switched off
             raise UserError(
-                f"The expert of '{task}' succeeded in {progress.n} of {n_tried} episodes, {n_episodes} are wanted."
+                f"The expert of '{task}' succeeded in {n_kept} of {n_tried} episodes, {n_episodes} are wanted."
             )
 
 

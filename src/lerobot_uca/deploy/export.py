@@ -26,8 +26,8 @@ from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
 # What these steps do is the same for all observations, so that a trace of it holds.
 TRACEABLE_STEPS = {
-    *("rename_observations_processor", "to_batch_processor", "device_processor"),
-    *("normalizer_processor", "unnormalizer_processor"),
+    *("rename_observations_processor", "point_cloud_processor", "to_batch_processor"),
+    *("device_processor", "normalizer_processor", "unnormalizer_processor"),
 }
 FILES = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
 """Of a checkpoint, besides its weights."""
@@ -74,8 +74,9 @@ class RawPolicy:
         config = self.policy.config
         assert config.input_features is not None
         n_steps = config.obs_span + 1
+        n_points = config.n_points or config.input_features[OBS_POINT_CLOUD].shape[0]
         return {
-            "point_cloud": (n_steps, *config.input_features[OBS_POINT_CLOUD].shape),
+            "point_cloud": (n_steps, n_points, 3),
             "state": (n_steps, config.n_states),
             "noise": (config.horizon, config.n_actions),
         }

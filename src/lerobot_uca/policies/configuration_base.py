@@ -7,7 +7,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud
 from lerobot_uca.inference.backends import BACKENDS
 from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
@@ -39,8 +39,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     horizon: int = 4
     # Actions executed before the next prediction, from the current step on.
     n_action_steps: int = 3
-    # How many points of a cloud the policy looks at, the first ones; null for all. Clouds of this package's
-    # environments are in farthest-point order, so the first ones are spread evenly.
+    # How many points of a cloud the policy looks at, sampled farthest point by farthest point; null for all. A cloud
+    # in this order already, as those of this package's environments are, keeps its first ones.
     n_points: int | None = None
 
     # LeRobot takes the point cloud for a state: it is normalised by channel.
@@ -106,7 +106,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         """
         self.validate_sizes()
         inputs: dict[str, PolicyFeature] = self.input_features or {}
-        for key, shape in ((OBS_POINT_CLOUD, "(N, 3)"), (OBS_STATE, "(S,)")):
+        cloud_key = find_point_cloud(inputs) or OBS_POINT_CLOUD
+        for key, shape in ((cloud_key, "(N, 3)"), (OBS_STATE, "(S,)")):
             if key not in inputs:
                 raise UserError(
                     f"Policy '{self.type}' needs the feature '{key}' of shape {shape}, "
@@ -114,17 +115,17 @@ class PointCloudPolicyConfig(PreTrainedConfig):
                 )
         if ACTION not in (self.output_features or {}):
             raise UserError(f"Policy '{self.type}' needs the feature '{ACTION}' of shape (A,).")
-        cloud, state, action = inputs[OBS_POINT_CLOUD], inputs[OBS_STATE], self.output_features[ACTION]
-        if len(cloud.shape) != 2 or cloud.shape[1] != 3 or cloud.shape[0] < (self.n_points or 1):
+        cloud, state, action = inputs[cloud_key], inputs[OBS_STATE], self.output_features[ACTION]
+        if len(cloud.shape) != 2 or cloud.shape[1] < 3 or cloud.shape[0] < (self.n_points or 1):
             raise UserError(
-                f"'{OBS_POINT_CLOUD}' must have shape (N, 3) with N at least {self.n_points or 1} (policy.n_points), "
-                f"got {tuple(cloud.shape)}."
+                f"'{cloud_key}' must have shape (N, 3) with N at least {self.n_points or 1} (policy.n_points), or more "
+                f"channels after xyz, got {tuple(cloud.shape)}."
             )
         for key, feature in ((OBS_STATE, state), (ACTION, action)):
             if len(feature.shape) != 1:
                 raise UserError(f"'{key}' must be a vector, got shape {tuple(feature.shape)}.")
         self.input_features: dict[str, PolicyFeature] | None = {
-            OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, tuple(cloud.shape)),
+            OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (cloud.shape[0], 3)),
             OBS_STATE: PolicyFeature(FeatureType.STATE, tuple(state.shape)),
         }
 

@@ -25,6 +25,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference.backends import make_backend
 from lerobot_uca.networks.observation_encoder import ObservationEncoder
+from lerobot_uca.policies import processor_base  # noqa: F401 (registers the steps that checkpoints name)
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.history import Frame, ObservationHistory
 

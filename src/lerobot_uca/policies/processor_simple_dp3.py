@@ -1,5 +1,7 @@
-"""Pre- and postprocessing of Simple DP3: LeRobot's own, under the name that LeRobot looks for."""
+"""Pre- and postprocessing of Simple DP3: all point-cloud policies' own, under the name that LeRobot looks for."""
 
-from lerobot.processor import make_default_pre_post_processors as make_simple_dp3_pre_post_processors
+from lerobot_uca.policies.processor_base import (
+    make_processors as make_simple_dp3_pre_post_processors,
+)
 
 __all__ = ["make_simple_dp3_pre_post_processors"]

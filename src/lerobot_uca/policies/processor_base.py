@@ -1,0 +1,159 @@
+"""Pre- and postprocessing of all point-cloud policies, and the step that makes their inputs uniform.
+
+Letters: B samples, O observation steps, N points, S state dimensions, T horizon, A action dimensions.
+"""
+
+import logging
+from dataclasses import dataclass, field
+from typing import Any, override
+
+import torch
+from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
+from lerobot.lerobot_types import EnvTransition, PolicyAction, TransitionKey
+from lerobot.processor import PolicyProcessorPipeline, ProcessorStep, ProcessorStepRegistry
+from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD, VALID_MASK_SUFFIX, find_point_cloud
+from lerobot_uca.point_clouds.geometry import subsample_farthest
+from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+
+logger = logging.getLogger(__name__)
+
+Processors = tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
+]
+
+
+def make_processors(
+    config: PointCloudPolicyConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
+) -> Processors:
+    """LeRobot's pipelines (rename, batch, device, normalise; and back), with a uniform point cloud before the batch."""
+    steps = make_default_policy_processor_steps(config, dataset_stats)
+    return make_policy_processor_pipelines(
+        [
+            steps.rename_observations,
+            PointCloudProcessorStep(n_points=config.n_points),
+            steps.add_batch_dim,
+            steps.to_device,
+            steps.normalize,
+        ],
+        [steps.unnormalize, steps.to_cpu],
+    )
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="point_cloud_processor")
+class PointCloudProcessorStep(ProcessorStep):
+    """Makes what datasets, environments and robots give into what the policies take.
+
+    - The cloud may stand under other plugins' names (`POINT_CLOUD_KEYS`) and have more channels than xyz, such as
+      colours; points that its mask calls invalid are replaced by valid ones.
+    - A cloud of more than n_points is sampled farthest point by farthest point. One that is in this order already (as
+      those of this package's environments are) keeps its first n_points.
+    - Everything becomes float32: LeRobot's normaliser takes on its input's type, statistics included.
+    - A single frame gets a batch dimension, and a state or action of one dimension, which LeRobot reads as numbers,
+      its last one.
+
+    Args:
+        n_points: points of a cloud that the policy looks at; None for all.
+    """
+
+    n_points: int | None = None
+    _has_said: bool = field(default=False, init=False, repr=False, compare=False)
+
+    @override
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        observation = dict(transition.get(TransitionKey.OBSERVATION) or {})
+        key = find_point_cloud(observation)
+        if key is None:  # the policy says what is missing
+            return transition
+        cloud = _as_float(observation.pop(key))
+        if cloud.ndim < 2 or cloud.shape[-1] < 3:
+            raise UserError(f"'{key}' must have shape (..., N, 3) or more channels, got {tuple(cloud.shape)}.")
+        if not self._has_said and (key != OBS_POINT_CLOUD or cloud.shape[-1] > 3):
+            self._has_said = True
+            shape = tuple(cloud.shape[-2:])
+            logger.warning("'%s' %s: its first three channels are taken as the point cloud's xyz.", key, shape)
+        mask = observation.pop(key.removesuffix(".xyz") + VALID_MASK_SUFFIX, None)
+        if mask is not None:
+            cloud = _with_valid_points(cloud, torch.as_tensor(mask).bool())
+        observation[OBS_POINT_CLOUD] = self._sampled(cloud[..., :3])
+        transition = transition.copy()
+        n_leading = cloud.ndim - 2
+        if OBS_STATE in observation:
+            observation[OBS_STATE] = _with_last_dimension(_as_float(observation[OBS_STATE]), n_leading + 1)
+        action = transition.get(TransitionKey.ACTION)
+        if action is not None:
+            # As many dimensions as the state: (B, A), or (B, T, A) where that is (B, O, S).
+            transition[TransitionKey.ACTION] = _with_last_dimension(_as_float(action), n_leading + 1)
+        transition[TransitionKey.OBSERVATION] = observation
+        return _with_batch(transition) if _is_single(transition) else transition
+
+    def _sampled(self, cloud: Tensor) -> Tensor:
+        """(..., N, 3) to (..., n_points, 3)."""
+        n_points = self.n_points
+        if n_points is None or cloud.shape[-2] <= n_points:
+            return cloud
+        points = cloud.detach().cpu().numpy().reshape(-1, *cloud.shape[-2:])
+        sampled = [torch.from_numpy(subsample_farthest(each, n_points)) for each in points]
+        return torch.stack(sampled).reshape(*cloud.shape[:-2], n_points, 3).to(cloud.device)
+
+    @override
+    def get_config(self) -> dict[str, Any]:
+        return {"n_points": self.n_points}
+
+    @override
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        observations = dict(features[PipelineFeatureType.OBSERVATION])
+        key = find_point_cloud(observations)
+        if key is not None:
+            n_points = self.n_points or observations.pop(key).shape[0]
+            observations[OBS_POINT_CLOUD] = PolicyFeature(FeatureType.STATE, (n_points, 3))
+        return {**features, PipelineFeatureType.OBSERVATION: observations}
+
+
+def _as_float(values: Any) -> Tensor:
+    return torch.as_tensor(values).to(torch.float32)
+
+
+def _with_last_dimension(values: Tensor, n_dimensions: int) -> Tensor:
+    """LeRobot reads a feature of shape (1,) as a number."""
+    return values if values.ndim >= n_dimensions else values.unsqueeze(-1)
+
+
+def _with_valid_points(cloud: Tensor, mask: Tensor) -> Tensor:
+    """Clouds (..., N, C) with the valid points of a mask (..., N) in their order, repeated in turn up to N."""
+    if mask.shape != cloud.shape[:-1]:
+        raise UserError(f"The mask of valid points must have shape {tuple(cloud.shape[:-1])}, got {tuple(mask.shape)}.")
+    n_valid = mask.sum(dim=-1, keepdim=True)
+    if not n_valid.all():
+        raise UserError("A point cloud must hold at least one valid point, got one whose mask is false everywhere.")
+    valid_first = (~mask).to(torch.uint8).argsort(dim=-1, stable=True)
+    chosen = valid_first.gather(-1, torch.arange(mask.shape[-1], device=mask.device) % n_valid)
+    return cloud.gather(-2, chosen[..., None].expand_as(cloud))
+
+
+def _is_single(transition: EnvTransition) -> bool:
+    """Whether this is one frame or one window, such as `dataset[0]`, and no batch."""
+    index = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("index")
+    is_single_row = isinstance(index, Tensor) and index.ndim == 0
+    return is_single_row or transition[TransitionKey.OBSERVATION][OBS_POINT_CLOUD].ndim == 2
+
+
+def _with_batch(transition: EnvTransition) -> EnvTransition:
+    observation = {**transition[TransitionKey.OBSERVATION]}
+    for key in (OBS_POINT_CLOUD, OBS_STATE):
+        if key in observation:
+            observation[key] = observation[key][None]
+    transition[TransitionKey.OBSERVATION] = observation
+    if transition.get(TransitionKey.ACTION) is not None:
+        transition[TransitionKey.ACTION] = transition[TransitionKey.ACTION][None]
+    rest = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
+    padding = {key: value[None] for key, value in rest.items() if key.endswith("_is_pad")}
+    transition[TransitionKey.COMPLEMENTARY_DATA] = {**rest, **padding}
+    return transition
