@@ -17,7 +17,6 @@ from torch import Tensor
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, VALID_MASK_SUFFIX, find_point_cloud
-from lerobot_uca.point_clouds.geometry import subsample_farthest
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 
 logger = logging.getLogger(__name__)
@@ -97,6 +96,8 @@ class PointCloudProcessorStep(ProcessorStep):
         n_points = self.n_points
         if n_points is None or cloud.shape[-2] <= n_points:
             return cloud
+        from lerobot_uca.point_clouds.geometry import subsample_farthest  # noqa: PLC0415 (needs a compiled wheel)
+
         points = cloud.detach().cpu().numpy().reshape(-1, *cloud.shape[-2:])
         sampled = [torch.from_numpy(subsample_farthest(each, n_points)) for each in points]
         return torch.stack(sampled).reshape(*cloud.shape[:-2], n_points, 3).to(cloud.device)
