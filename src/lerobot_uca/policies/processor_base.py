@@ -96,7 +96,7 @@ class PointCloudProcessorStep(ProcessorStep):
         n_points = self.n_points
         if n_points is None or cloud.shape[-2] <= n_points:
             return cloud
-        from lerobot_uca.point_clouds.geometry import subsample_farthest  # noqa: PLC0415 (needs a compiled wheel)
+        from lerobot_uca.point_clouds.geometry import subsample_farthest
 
         points = cloud.detach().cpu().numpy().reshape(-1, *cloud.shape[-2:])
         sampled = [torch.from_numpy(subsample_farthest(each, n_points)) for each in points]
