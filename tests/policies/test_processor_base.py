@@ -142,3 +142,8 @@ def test_one_dimension_that_lerobot_reads_as_a_number(leading):
     expected = leading or (1,)
     assert result["observation"][STATE].shape == (*expected, 1)
     assert result["action"].shape == (*expected, 1)
+
+
+def test_a_state_without_batch_beside_a_cloud_with_one():
+    batch = preprocessor()({OBS_POINT_CLOUD: torch.rand(1, N_POINTS, 3), STATE: torch.rand(N_STATES)})
+    assert batch[STATE].shape == (1, N_STATES)

@@ -52,9 +52,13 @@ class OnnxPolicy:
         self._action_queue: deque[np.ndarray] = deque()
 
     def select_action(self, point_cloud: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """The next action (A,), from the newest point cloud (N, 3) and state (S,). Call it once every step."""
+        """The next action (A,), from the newest point cloud and state (S,). Call it once every step.
+
+        The cloud is (N, 3). Of one with more channels the first three are taken as xyz; one with more points is sampled
+        farthest point by farthest point, as the policy does.
+        """
         frame = (
-            _checked("point_cloud", point_cloud, self._cloud_shape),
+            _checked("point_cloud", _sampled(point_cloud, self._cloud_shape[0]), self._cloud_shape),
             _checked("state", state, self._state_shape),
         )
         self._history.extend([frame] * (1 if self._history else self._n_steps))
@@ -81,6 +85,21 @@ def check_version(version: str) -> None:
     if tuple(int(part) for part in version.split(".")[:2]) < MIN_ONNXRUNTIME:
         minimum = ".".join(map(str, MIN_ONNXRUNTIME))
         raise RuntimeError(f"onnxruntime must be at least {minimum}, got {version}.")
+
+
+def _sampled(point_cloud: np.ndarray, n_points: int) -> np.ndarray:
+    points = np.asarray(point_cloud, dtype=np.float32)
+    if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points).all():
+        return points  # refused by the check that follows
+    points = points[:, :3]
+    if len(points) <= n_points:
+        return points
+    order = np.zeros(n_points, dtype=np.int64)
+    distances = np.full(len(points), np.inf, dtype=np.float32)
+    for i in range(1, n_points):
+        distances = np.minimum(distances, np.square(points - points[order[i - 1]]).sum(axis=1))
+        order[i] = distances.argmax()
+    return points[order]
 
 
 def _checked(name: str, value: np.ndarray, shape: tuple[int, ...] | list[int]) -> np.ndarray:

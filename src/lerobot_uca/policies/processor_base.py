@@ -81,13 +81,11 @@ class PointCloudProcessorStep(ProcessorStep):
             cloud = _with_valid_points(cloud, torch.as_tensor(mask).bool())
         observation[OBS_POINT_CLOUD] = self._sampled(cloud[..., :3])
         transition = transition.copy()
-        n_leading = cloud.ndim - 2
         if OBS_STATE in observation:
-            observation[OBS_STATE] = _with_last_dimension(_as_float(observation[OBS_STATE]), n_leading + 1)
+            observation[OBS_STATE] = _with_last_dimension(_as_float(observation[OBS_STATE]), cloud)
         action = transition.get(TransitionKey.ACTION)
         if action is not None:
-            # As many dimensions as the state: (B, A), or (B, T, A) where that is (B, O, S).
-            transition[TransitionKey.ACTION] = _with_last_dimension(_as_float(action), n_leading + 1)
+            transition[TransitionKey.ACTION] = _with_last_dimension(_as_float(action), cloud)
         transition[TransitionKey.OBSERVATION] = observation
         return _with_batch(transition) if _is_single(transition) else transition
 
@@ -122,9 +120,13 @@ def _as_float(values: Any) -> Tensor:
     return torch.as_tensor(values).to(torch.float32)
 
 
-def _with_last_dimension(values: Tensor, n_dimensions: int) -> Tensor:
-    """LeRobot reads a feature of shape (1,) as a number."""
-    return values if values.ndim >= n_dimensions else values.unsqueeze(-1)
+def _with_last_dimension(values: Tensor, cloud: Tensor) -> Tensor:
+    """A vector of one dimension, which LeRobot reads as a number, as a vector again.
+
+    To a cloud (..., N, C) belong vectors (..., D), so here numbers (...); an action has T where the cloud has O.
+    """
+    is_number = values.ndim == cloud.ndim - 2 and values.shape[:1] == cloud.shape[: min(values.ndim, 1)]
+    return values.unsqueeze(-1) if is_number else values
 
 
 def _with_valid_points(cloud: Tensor, mask: Tensor) -> Tensor:
