@@ -8,6 +8,7 @@ from pathlib import Path
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid
 from lerobot_uca.protocol.launchers import local, n_cores
+from lerobot_uca.protocol.report import report
 from lerobot_uca.protocol.run import make_folder, run
 
 RUN_HELP = f"""\
@@ -32,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     commands = parser.add_subparsers(dest="command", required=True)
     _add_run(commands)
+    _add_report(commands)
     args = parser.parse_args(arguments)
     args.do(args)
 
@@ -61,3 +63,32 @@ def _run(args: argparse.Namespace) -> None:
         raise UserError(f"--parallel must be at least 1, got {args.parallel}.")
     if not run(make_folder(args.output, args.setting), cells, local(args.parallel), args.expert):
         sys.exit(1)
+
+
+REPORT_HELP = """\
+The paper's Tables 1 to 3 with the paper's numbers beside ours, as Markdown, CSV and LaTeX, and figures (PNG, SVG).
+
+  lerobot-uca-benchmark report runs/small --output=report --html
+
+Cells that are missing are shown as missing, so a report can be made while the run goes on. Several folders are taken
+together if they were made with one setting. The report's folder holds all rows, and can itself be reported.
+"""
+
+
+def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    parser = commands.add_parser(
+        "report",
+        help="tables and figures beside the paper's",
+        description=REPORT_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("runs", type=Path, nargs="+", metavar="DIR", help="folder of a run or of a report")
+    parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
+    parser.add_argument("--html", action="store_true", help="also one self-contained page, report.html")
+    parser.set_defaults(do=_report)
+
+
+def _report(args: argparse.Namespace) -> None:
+    print(report(args.runs, args.output, as_html=args.html))
+    print(f"Written to {args.output}.", file=sys.stderr)

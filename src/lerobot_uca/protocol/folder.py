@@ -76,7 +76,7 @@ class RunFolder:
                     write_json(file, values)
         except OSError as error:
             raise UserError(f"--output '{path}' cannot be written: {error}") from error
-        difference = _first_difference(_read_json(file), values)
+        difference = first_difference(_read_json(file), values)
         if difference:
             raise UserError(
                 f"'{path}' was made with another setting: {difference}. Choose another --output, or the same --setting."
@@ -118,8 +118,15 @@ class RunFolder:
 
     def read(self) -> Iterator[Row | CorruptRow]:
         """All rows of all cells, and the lines that are not rows."""
-        for path in sorted(self.path.glob("cells/*/*/*/*/rows/*.csv")):
+        for path in [*self.path.glob("episodes.csv"), *sorted(self.path.glob("cells/*/*/*/*/rows/*.csv"))]:
             yield from read_rows(path)
+
+    def records(self) -> Iterator[dict[str, Any]]:
+        """What was recorded of each finished cell."""
+        for path in self.path.glob("cells.json"):
+            yield from _read_json(path)["cells"]
+        for path in sorted(self.path.glob("cells/*/*/*/*/cell.json")):
+            yield _read_json(path)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -136,13 +143,13 @@ def _read_json(path: Path) -> Any:
         raise UserError(f"'{path}' cannot be read: {error}") from error
 
 
-def _first_difference(made: Any, given: Any, name: str = "") -> str | None:
+def first_difference(made: Any, given: Any, name: str = "") -> str | None:
     """The first value in which two settings differ, described; None if there is none. Names and words do not count."""
     if isinstance(made, dict) and isinstance(given, dict):
         for key in dict.fromkeys([*made, *given]):
             if not name and key in ("name", "description"):
                 continue
-            difference = _first_difference(made.get(key), given.get(key), f"{name}.{key}" if name else key)
+            difference = first_difference(made.get(key), given.get(key), f"{name}.{key}" if name else key)
             if difference:
                 return difference
         return None

@@ -1,0 +1,135 @@
+"""Figures of results. They read only what `Results` has read from CSV and JSON files."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol import paper
+from lerobot_uca.protocol.cells import POLICIES
+from lerobot_uca.protocol.results import Results
+
+COLOURS = dict(
+    zip(POLICIES, ("#0072B2", "#56B4E9", "#009E73", "#CC79A7", "#D55E00", "#E69F00", "#7F7F7F", "#000000"), strict=True)
+)
+"""Colours that people who see fewer colours can tell apart, by policy."""
+N_CURVE_COLUMNS = 4
+
+
+def draw(results: Results, folder: Path) -> list[Path]:
+    """Write every figure for which there are results, as PNG and SVG; the SVG files.
+
+    Raises:
+        UserError: if matplotlib is not installed.
+    """
+    try:
+        import matplotlib as mpl
+
+        mpl.use("Agg")
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise UserError("Figures need matplotlib: pip install 'lerobot_policy_uca_flow[pictures]'.") from error
+    written = []
+    # Without a date, and with ids that do not change, equal results give equal files.
+    with mpl.rc_context({"svg.hashsalt": "lerobot_uca", "svg.fonttype": "none", "font.size": 9}):
+        for name, figure in FIGURES.items():
+            drawn = figure(results, plt)
+            if drawn is None:
+                continue
+            for ending in ("png", "svg"):
+                path = folder / f"{name}.{ending}"
+                metadata: Any = {"Date": None} if ending == "svg" else {}
+                drawn.savefig(path, dpi=150, bbox_inches="tight", metadata=metadata)
+            plt.close(drawn)
+            written.append(folder / f"{name}.svg")
+    return written
+
+
+def curves(results: Results, plt: Any) -> Any:
+    """Success over epochs, a panel a task; the band is from the lowest to the highest seed."""
+    tasks = [task for task in results.tasks if any(results.curve(task, policy) for policy in results.policies)]
+    if not tasks:
+        return None
+    n_columns = min(N_CURVE_COLUMNS, len(tasks))
+    n_rows = -(-len(tasks) // n_columns)
+    figure, axes = plt.subplots(n_rows, n_columns, figsize=(3 * n_columns, 2.4 * n_rows), squeeze=False, sharey=True)
+    for axis in axes.flat[len(tasks) :]:
+        axis.set_visible(False)
+    for axis, task in zip(axes.flat, tasks, strict=False):
+        for policy in results.policies:
+            curve = results.curve(task, policy)
+            epochs = list(curve)
+            rates = [np.multiply(100, each) for each in curve.values()]
+            means = [each.mean() for each in rates]
+            axis.plot(epochs, means, marker=".", color=COLOURS[policy], label=POLICIES[policy].title)
+            band = [each.min() for each in rates], [each.max() for each in rates]
+            axis.fill_between(epochs, *band, color=COLOURS[policy], alpha=0.2, linewidth=0)
+        axis.set_title(task)
+        axis.set_ylim(-3, 103)
+        axis.set_xlabel("epochs")
+    for row in axes:
+        row[0].set_ylabel("success [%]")
+    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="upper center", bbox_to_anchor=(0.5, 0), ncols=4)
+    figure.tight_layout()
+    return figure
+
+
+def success_and_latency(results: Results, plt: Any) -> Any:
+    """Success against latency (the paper's Figure 1b), over each policy's own tasks; the paper's numbers hollow."""
+    figure, axis = plt.subplots(figsize=(5, 3.6))
+    n_drawn = 0
+    for policy in results.policies:
+        time, success = results.milliseconds(results.tasks, policy), results.honest(results.tasks, policy)
+        if time and success:
+            n_drawn += 1
+            mean, low, high = (100 * value for value in success)
+            bars = [[max(0, mean - low)], [max(0, high - mean)]]
+            axis.errorbar(time[0], mean, yerr=bars, fmt="o", color=COLOURS[policy], label=POLICIES[policy].title)
+    if not n_drawn:
+        plt.close(figure)
+        return None
+    for policy in paper.SUCCESS:
+        point = paper.MILLISECONDS[policy]["average"].mean, paper.SUCCESS[policy]["average"].mean
+        axis.plot(*point, "o", color=COLOURS[policy], fillstyle="none", label=f"{POLICIES[policy].title}, paper")
+    axis.set_xscale("log")
+    axis.set_xlabel("inference [ms]")
+    axis.set_ylabel("success [%]")
+    axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
+def bars(results: Results, plt: Any) -> Any:
+    """Success on each task with its interval; a line where the paper prints a number."""
+    from lerobot_uca.protocol.tables import of_task
+
+    tasks = [task for task in results.tasks if any(results.seeds(task, policy) for policy in results.policies)]
+    if not tasks:
+        return None
+    height = 0.8 / len(results.policies)
+    figure, axis = plt.subplots(figsize=(6, 0.6 + 0.22 * len(tasks) * max(1, len(results.policies) / 2)))
+    for index, policy in enumerate(results.policies):
+        for row, task in enumerate(tasks):
+            estimate, printed = results.honest((task,), policy), of_task(task, policy)
+            y = row + (index - (len(results.policies) - 1) / 2) * height
+            if estimate:
+                mean, low, high = (100 * value for value in estimate)
+                axis.barh(y, mean, height=0.9 * height, color=COLOURS[policy], xerr=[[mean - low], [high - mean]])
+            if printed:
+                axis.plot([printed.mean] * 2, [y - height / 2, y + height / 2], color="black", linewidth=2)
+    axis.set_yticks(range(len(tasks)), tasks)
+    axis.invert_yaxis()
+    axis.set_xlim(0, 103)
+    axis.set_xlabel("success [%]; black: the paper's, where it prints one")
+    handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[policy]) for policy in results.policies]
+    titles = [POLICIES[policy].title for policy in results.policies]
+    figure.legend(handles, titles, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=4)
+    return figure
+
+
+FIGURES: dict[str, Callable[[Results, Any], Any]] = {
+    "success_over_epochs": curves,
+    "success_and_latency": success_and_latency,
+    "success_by_task": bars,
+}

@@ -1,0 +1,79 @@
+"""`lerobot-uca-benchmark report`: tables and figures of one or several runs."""
+
+import html
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol.figures import draw
+from lerobot_uca.protocol.results import Results
+from lerobot_uca.protocol.tables import TABLES, setting_of
+
+STYLE = """\
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
+section { overflow-x: auto } table { border-collapse: collapse; font-size: 0.85rem; white-space: nowrap }
+th, td { padding: 0.25rem 0.6rem; text-align: left; border-bottom: 1px solid #ddd }
+tbody tr:hover { background: #f3f6fa } svg { max-width: 100%; height: auto }
+"""
+
+
+def report(runs: Sequence[Path], output: Path, *, as_html: bool) -> str:
+    """Write tables (Markdown, CSV, LaTeX), figures (PNG, SVG) and the results themselves; the tables as Markdown.
+
+    Raises:
+        UserError: if there are no results, or the folder cannot be written.
+    """
+    results, corrupt = Results.read(runs)
+    for line in corrupt:
+        print(f"warning: {line}", file=sys.stderr)
+    if not results.rows:
+        raise UserError(f"There are no results yet in {', '.join(map(str, runs))}.")
+    tables = [make(results) for make in TABLES]
+    markdown = "\n".join(table.markdown() for table in tables)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        results.write(output)
+        (output / "report.md").write_text(markdown, encoding="utf-8")
+        for table in tables:
+            (output / f"{table.name}.csv").write_text(table.csv(), encoding="utf-8")
+            (output / f"{table.name}.tex").write_text(table.latex(), encoding="utf-8")
+        figures = draw(results, output)
+        if as_html:
+            page = _page(results, [table.html() for table in tables], figures)
+            (output / "report.html").write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"--output '{output}' cannot be written: {error}") from error
+    return markdown
+
+
+def _page(results: Results, tables: Sequence[str], figures: Sequence[Path]) -> str:
+    """One page that needs nothing else."""
+    pictures = [
+        f"<figure>{_inline(path, index)}<figcaption>{path.stem.replace('_', ' ').capitalize()}</figcaption></figure>"
+        for index, path in enumerate(figures)
+    ]
+    n_cells = len(results.records)
+    body = "\n".join([tables[0], *pictures, *tables[1:]])
+    return f"""<!doctype html>
+<html lang="en">
+<head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>UCA-Flow: results beside the paper's</title>
+<style>{STYLE}</style></head>
+<body>
+<h1>UCA-Flow: results beside the paper's</h1>
+<p>{n_cells} trained cells (a cell is one policy on one task with one training seed), {len(results.rows)} episodes.
+{html.escape(setting_of(results))}</p>
+{body}
+</body></html>
+"""
+
+
+def _inline(path: Path, index: int) -> str:
+    """An SVG as a part of a page: without its XML header, with ids that no other figure has."""
+    text = path.read_text(encoding="utf-8")
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'\bid="', f'id="f{index}-', text)
+    return re.sub(r'(url\(#|href="#)', rf"\1f{index}-", text)

@@ -1,0 +1,156 @@
+"""Results of one or several runs, by cell, as the tables and figures need them."""
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol.cells import POLICIES, Cell
+from lerobot_uca.protocol.folder import RunFolder, first_difference, write_json
+from lerobot_uca.protocol.intervals import Estimate, Successes, mean_over_tasks, wilson
+from lerobot_uca.protocol.rows import CorruptRow, Row, write_rows
+from lerobot_uca.protocol.setting import Setting
+
+N_BEST = 5
+
+
+class Results:
+    """Rows of evaluation episodes and what was recorded of each finished cell.
+
+    Args:
+        setting: with which all of them were made.
+        rows: of all cells.
+        records: the contents of their cell.json.
+    """
+
+    def __init__(self, setting: Setting, rows: Iterable[Row], records: Iterable[dict[str, Any]]) -> None:
+        self.setting, self.rows = setting, sorted(set(rows), key=lambda row: (*row.cell, row.is_final, *row[3:]))
+        self.records = {Cell(**record["cell"]): record for record in records}
+        self._final: dict[Cell, dict[int, bool]] = defaultdict(dict)
+        self._interim: dict[Cell, dict[int, list[bool]]] = defaultdict(lambda: defaultdict(list))
+        self._epochs: dict[tuple[str, int], float] = {}
+        for row in self.rows:
+            self._epochs[row.task, row.step] = row.epoch
+            if row.is_final:
+                self._final[row.cell][row.episode_seed] = row.success
+            else:
+                self._interim[row.cell][row.step].append(row.success)
+        cells = {*self._final, *self._interim}
+        self.policies = [policy for policy in POLICIES if any(cell.policy == policy for cell in cells)]
+        self.tasks = sorted({cell.task for cell in cells})
+        self._cells = sorted(cells)
+
+    @classmethod
+    def read(cls, paths: Sequence[Path]) -> tuple[Self, list[CorruptRow]]:
+        """What folders hold, and the lines in them that are not rows.
+
+        Raises:
+            UserError: if a path is not a run's folder, or they were made with different settings.
+        """
+        folders = [RunFolder.open(path) for path in paths]
+        first = folders[0]
+        for other in folders[1:]:
+            difference = first_difference(first.setting.as_values(), other.setting.as_values())
+            if difference:
+                raise UserError(
+                    f"'{first.path}' and '{other.path}' were made with different settings: {difference}. "
+                    "A table holds results of one setting."
+                )
+        found = [row for folder in folders for row in folder.read()]
+        rows = [row for row in found if isinstance(row, Row)]
+        records = [record for folder in folders for record in folder.records()]
+        return cls(first.setting, rows, records), [row for row in found if isinstance(row, CorruptRow)]
+
+    def write(self, folder: Path) -> None:
+        """Write all of it into a folder that `read` reads."""
+        write_json(folder / "setting.json", self.setting.as_values())
+        write_rows(folder / "episodes.csv", self.rows)
+        write_json(folder / "cells.json", {"cells": [self.records[cell] for cell in sorted(self.records)]})
+
+    def seeds(self, task: str, policy: str) -> list[int]:
+        """Training seeds whose last checkpoint is evaluated."""
+        return [cell.seed for cell in self._cells if cell[:2] == (task, policy) and cell in self._final]
+
+    # The honest rule: the last checkpoint, fresh episodes. ------------------------------------------------------
+
+    def successes(self, task: str, policy: str) -> Successes:
+        """Of the last checkpoints' fresh episodes, for each training seed."""
+        return [
+            np.array([int(success) for success in self._final[Cell(task, policy, seed)].values()])
+            for seed in self.seeds(task, policy)
+        ]
+
+    def honest(self, tasks: Sequence[str], policy: str) -> Estimate | None:
+        """Success on those of the tasks that are there: Wilson's interval for one task, else the bootstrap's."""
+        there = [successes for task in tasks if (successes := self.successes(task, policy))]
+        if not there:
+            return None
+        if len(tasks) == 1:
+            episodes = np.concatenate(there[0])
+            return wilson(int(episodes.sum()), len(episodes))
+        return mean_over_tasks(there)
+
+    def difference(self, policy: str, other: str, tasks: Sequence[str]) -> tuple[Estimate, list[str]] | None:
+        """How much more of the same episodes a policy succeeds in than another, on the tasks both have, and those.
+
+        Paired by task, training seed and episode.
+        """
+        paired = {task: pairs for task in tasks if (pairs := self._pairs(task, policy, other))}
+        return (mean_over_tasks(list(paired.values())), list(paired)) if paired else None
+
+    def _pairs(self, task: str, policy: str, other: str) -> list[NDArray[np.int64]]:
+        pairs = []
+        for seed in self.seeds(task, policy):
+            first, second = (self._final.get(Cell(task, name, seed), {}) for name in (policy, other))
+            common = first.keys() & second.keys()
+            if common:
+                pairs.append(np.array([int(first[episode]) - int(second[episode]) for episode in sorted(common)]))
+        return pairs
+
+    # The paper's rule: the mean of the best five evaluations during training, of each seed. ---------------------
+
+    def papers_rule(self, tasks: Sequence[str], policy: str) -> tuple[float, float] | None:
+        """Success on those of the tasks that are there: mean and standard deviation over seeds of their means."""
+        by_seed: dict[int, list[float]] = defaultdict(list)
+        for cell in self._cells:
+            if cell.task in tasks and cell.policy == policy:
+                rates = sorted((float(np.mean(each)) for each in self._interim[cell].values()), reverse=True)
+                if len(rates) >= N_BEST:
+                    by_seed[cell.seed].append(float(np.mean(rates[:N_BEST])))
+        if not by_seed:
+            return None
+        every = [rate for rates in by_seed.values() for rate in rates]
+        return float(np.mean(every)), float(np.std([np.mean(rates) for rates in by_seed.values()]))
+
+    def curve(self, task: str, policy: str) -> dict[float, list[float]]:
+        """Success by epoch, of each seed."""
+        by_epoch: dict[float, list[float]] = defaultdict(list)
+        for cell in self._cells:
+            if cell[:2] == (task, policy):
+                for step, successes in sorted(self._interim[cell].items()):
+                    by_epoch[self._epochs[task, step]].append(float(np.mean(successes)))
+        return dict(sorted(by_epoch.items()))
+
+    # Inference. -------------------------------------------------------------------------------------------------
+
+    def milliseconds(self, tasks: Sequence[str], policy: str) -> tuple[float, float] | None:
+        """Mean and standard deviation over cells of the median time for a chunk."""
+        times = [
+            record["inference"]["median_ms"]
+            for cell, record in self.records.items()
+            if cell.task in tasks and cell.policy == policy
+        ]
+        return (float(np.mean(times)), float(np.std(times))) if times else None
+
+    def hardware(self) -> list[str]:
+        """What the cells ran on."""
+        kinds = {json.dumps(record["hardware"], sort_keys=True): record["hardware"] for record in self.records.values()}
+        return [
+            f"{each['gpu'] or each['cpu']} ({each['cores']} cores, {each['threads']} thread a cell)"
+            for each in kinds.values()
+        ]

@@ -1,0 +1,187 @@
+"""Tables and figures of results made up so that every number can be told in advance."""
+
+import csv
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, Cell
+from lerobot_uca.protocol.command import main
+from lerobot_uca.protocol.folder import RunFolder, write_json
+from lerobot_uca.protocol.paper import ABLATION, COLUMNS, MILLISECONDS, SUCCESS
+from lerobot_uca.protocol.results import Results
+from lerobot_uca.protocol.rows import Row, write_rows
+from lerobot_uca.protocol.setting import Setting
+
+SETTING = Setting.from_values(
+    "tiny",
+    {"description": "made up", "batch_size": 8, "lengths": {"metaworld": {"steps": 60, "evaluations": 6}}},
+)
+REACH, WALL = "metaworld/reach", "metaworld/reach-wall"
+
+
+def make_rows(cell, n_final, interim):
+    """`n_final` of 100 fresh episodes succeed, and of each evaluation's 20 as many as `interim` says."""
+    for index in range(100):
+        yield Row(*cell, 60, 6.0, True, 4_000_000 + index, index < n_final, 1.5, 200, 5.0)
+    for evaluation, n_successes in enumerate(interim, start=1):
+        for index in range(20):
+            seed = 2_000_000 + 20 * evaluation + index
+            yield Row(*cell, 10 * evaluation, float(evaluation), False, seed, index < n_successes, 1.5, 200, 5.0)
+
+
+def add_cell(folder, cell, n_final, interim=(0, 20, 20, 20, 20, 10)):
+    files = folder.cell(cell)
+    files.rows.mkdir(parents=True)
+    rows = list(make_rows(cell, n_final, interim))
+    write_rows(files.rows / "final.csv", [row for row in rows if row.is_final])
+    write_rows(files.rows / "step.csv", [row for row in rows if not row.is_final])
+    record = {
+        "cell": cell._asdict(),
+        "inference": {"median_ms": 2.0 + cell.seed},
+        "hardware": {"cpu": "a CPU", "gpu": None, "cores": 2, "threads": 1},
+    }
+    write_json(files.result, record)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two tasks, two seeds of UCA-Flow and one of AdaLN on one of them."""
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    for seed, n_final in enumerate((80, 90)):
+        add_cell(folder, Cell(REACH, "uca_flow", seed), n_final)
+        add_cell(folder, Cell(WALL, "uca_flow", seed), 100)
+    add_cell(folder, Cell(REACH, "adaln", 0), 60)
+    return folder
+
+
+def read_csv(path):
+    with path.open(newline="") as file:
+        return list(csv.reader(file))
+
+
+def test_the_papers_averages_are_the_means_of_its_columns():
+    """As printed: the numbers were copied right. UCA-Flow's own average success is the one that does not agree."""
+    n_tasks = [1, 1, 1, *(len(PAPER_GROUPS[group]) for group in ("easy", "medium", "hard", "very_hard"))]
+    for table in (SUCCESS, MILLISECONDS):
+        for policy, row in table.items():
+            *numbers, printed = (row[column].mean for column in COLUMNS)
+            mean = sum(n * number for n, number in zip(n_tasks, numbers, strict=True)) / 37
+            expected = 86.4 if table is SUCCESS and policy == "uca_flow" else printed
+            assert mean == pytest.approx(expected, abs=0.15)
+    assert set(ABLATION) < set(POLICIES)
+    assert all(tuple(row) == SUITES["ablation"] for row in ABLATION.values())
+    for task in ("door", "pen"):
+        assert ABLATION["uca_flow"][f"adroit/{task}"] == SUCCESS["uca_flow"][task]
+
+
+def test_table_1(folder, tmp_path, capsys):
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    header, *rows = read_csv(tmp_path / "report" / "table_1.csv")
+    assert header[2:] == [
+        *("Adroit hammer", "Adroit door", "Adroit pen", "easy (21)", "medium (4)", "hard (4)", "very hard (5)"),
+        "average (37)",
+    ]
+    lines = {(rows[index - index % 3][0], row[1]): row[2:] for index, row in enumerate(rows)}
+    assert lines["UCA-Flow", "paper"][3] == "92.4 +- 1.2"
+    # The best five of 0, 100, 100, 100, 100 and 50 %.
+    assert lines["UCA-Flow", "ours, paper's rule"][3] == "90.0 +- 0.0 (2 of 21 tasks)"
+    honest = lines["UCA-Flow", "ours, honest"]
+    assert honest[:3] == ["missing"] * 3
+    assert honest[3].startswith("92.5 [")  # the mean of 85 and 100
+    assert honest[3].endswith("(2 of 21 tasks)")
+    assert honest[7].endswith("(2 of 37 tasks)")
+    assert lines["DP3", "ours, honest"] == ["missing"] * 8
+    assert "Setting 'tiny': made up. Made on: a CPU (2 cores, 1 thread a cell)." in capsys.readouterr().out
+
+
+def test_wilson_for_a_task_and_milliseconds_for_a_policy(folder):
+    results, corrupt = Results.read([folder.path])
+    assert corrupt == []
+    assert results.honest([REACH], "uca_flow") == pytest.approx((0.85, 0.7939, 0.8930), abs=1e-3)  # 170 of 200
+    assert results.milliseconds(results.tasks, "uca_flow") == (2.5, 0.5)
+    assert results.papers_rule([REACH], "uca_flow") == (pytest.approx(0.9), 0)
+
+
+def test_with_less_than_five_evaluations_the_papers_rule_has_no_number(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    add_cell(folder, Cell(REACH, "uca_flow", 0), 50, interim=(20, 20, 20, 20))
+    results, _ = Results.read([folder.path])
+    assert results.papers_rule([REACH], "uca_flow") is None
+
+
+def test_differences_are_paired(folder, tmp_path):
+    """Of seed 0's episodes on reach, the only ones that both have: 80 and 60 of the same 100."""
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    _, row = read_csv(tmp_path / "report" / "differences.csv")
+    assert row[:2] == ["UCA-Flow minus - Unified/a: AdaLN", "1"]
+    assert row[2].startswith("20.0 [")
+    assert row[3] == "UCA-Flow is better"
+
+
+def test_a_reports_folder_can_be_reported(folder, tmp_path):
+    main(["report", str(folder.path), f"--output={tmp_path}/first"])
+    main(["report", str(tmp_path / "first"), f"--output={tmp_path}/second", "--html"])
+    for name in ("episodes.csv", "cells.json", "report.md", "table_3.tex", "success_over_epochs.svg"):
+        assert (tmp_path / "first" / name).read_text() == (tmp_path / "second" / name).read_text()
+    together, _ = Results.read([folder.path, tmp_path / "first"])
+    assert together.rows == Results.read([folder.path])[0].rows
+
+
+class Page(HTMLParser):
+    """Checks that elements close as they open, and collects what they refer to."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.references, self.ids, self.n_svg = [], [], [], 0
+
+    def handle_starttag(self, tag, attributes):
+        self.n_svg += tag == "svg"
+        self.references += [value for name, value in attributes if name in ("src", "href", "xlink:href")]
+        self.ids += [value for name, value in attributes if name == "id"]
+        if tag not in ("meta", "link", "br"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.references += [value for name, value in attributes if name in ("src", "href", "xlink:href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_self_contained(folder, tmp_path):
+    main(["report", str(folder.path), f"--output={tmp_path}/report", "--html"])
+    text = (tmp_path / "report" / "report.html").read_text()
+    page = Page()
+    page.feed(text)
+    assert page.open == []
+    assert page.n_svg == 3
+    assert all(reference.startswith("#") for reference in page.references)
+    assert len(set(page.ids)) == len(page.ids)
+    assert "<script" not in text
+    for png in ("success_over_epochs", "success_and_latency", "success_by_task"):
+        assert (tmp_path / "report" / f"{png}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_corrupt_row_is_named_and_the_rest_is_reported(folder, tmp_path, capsys):
+    path = folder.cell(Cell(REACH, "adaln", 0)).rows / "final.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:5], lines[5][:20], *lines[6:]]))
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    assert capsys.readouterr().err.startswith(f"warning: {path}, line 6 is left out: it has too many or too few")
+    assert "table_1.csv" in {file.name for file in (tmp_path / "report").iterdir()}
+
+
+def test_results_of_two_settings_are_not_mixed(folder, tmp_path):
+    other = RunFolder.create(tmp_path / "other", replace(SETTING, batch_size=4))
+    with pytest.raises(UserError, match="were made with different settings: batch_size was 8, now it is 4"):
+        Results.read([folder.path, other.path])
+
+
+def test_a_run_without_results(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    with pytest.raises(UserError, match="There are no results yet"):
+        main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    assert not (tmp_path / "report").exists()
