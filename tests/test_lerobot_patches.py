@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 
-from lerobot_uca import lerobot_patches
+from lerobot_uca import configs, lerobot_patches
 from lerobot_uca.data import batched_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.errors import UserError
@@ -187,3 +188,20 @@ def test_the_settings_of_a_training_are_saved_as_they_were_used(monkeypatch, dat
     assert workers(monkeypatch, config) == 0
     config.save_pretrained(tmp_path)
     assert json.loads((tmp_path / "train_config.json").read_text())["num_workers"] == 0
+
+
+def test_a_configuration_is_found_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    by_name = TrainPipelineConfig.from_pretrained("uca_flow_small", cli_args=["--dataset.repo_id=test/data"])
+    assert (by_name.policy.type, by_name.policy.dim, by_name.steps) == ("uca_flow", 128, 600)
+    (tmp_path / "uca_flow_small").write_text('{"steps": 7, "dataset": {"repo_id": "test/data"}}')
+    own = TrainPipelineConfig.from_pretrained("uca_flow_small", cli_args=[])
+    assert own.steps == 7, "the user's own file of that name comes first"
+
+
+@pytest.mark.parametrize("path", sorted(configs.FOLDER.glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_configuration_holds_only_what_lerobot_reads(path):
+    config = TrainPipelineConfig.from_pretrained(path, cli_args=["--dataset.repo_id=test/data"])
+    settings = yaml.safe_load(path.read_text())
+    assert config.steps == settings["steps"]
+    assert config.policy.type == settings["policy"]["type"]

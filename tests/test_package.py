@@ -23,7 +23,7 @@ ALLOWED = {
     "visual": {"policies", "data", "envs", "point_clouds", "errors", "features"},
     "deploy": {"policies", "inference", "errors", "features"},
     "protocol": {"policies", "data", "envs", "errors", "features", "processes"},
-    "lerobot_patches": {"data", "policies", "errors", "features", "processes"},
+    "lerobot_patches": {"configs", "data", "policies", "errors", "features", "processes"},
     "commands": {"data", "deploy", "protocol", "robots", "visual", "errors", "processes"},
 }
 
@@ -77,6 +77,7 @@ def test_a_wheel_holds_the_package_and_nothing_else(tmp_path):
     names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
     assert {name.split("/")[0] for name in names} == {"lerobot_uca", "lerobot_policy_uca_flow.py"}
     assert len(names) == sum(len(list(SOURCE.rglob(kind))) for kind in ("*.py", "*.yaml")) + 1
+    assert {"lerobot_uca/configs/uca_flow_small.yaml", "lerobot_uca/configs/uca_flow_paper.yaml"} <= set(names)
 
 
 def test_lerobot_discovers_everything_in_a_fresh_interpreter():

@@ -18,6 +18,7 @@ from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
 
+from lerobot_uca import configs
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
@@ -37,6 +38,7 @@ def install() -> None:
     shorten_decoder_warning()
     if lerobot.__version__ == SUPPORTED_LEROBOT:
         check_output_folders()
+        find_configs_by_name()
         read_in_batches()
 
 
@@ -110,6 +112,21 @@ def check_output_folder(output_dir: Path | str | None) -> None:
         raise UserError(f"output_dir '{output_dir}' cannot be written: '{parent}' is not a writable folder.")
 
 
+def find_configs_by_name() -> None:
+    """`--config_path=uca_flow_small` finds the file of that name in this package. LeRobot asks the Hub for it."""
+    original = TrainPipelineConfig.from_pretrained
+    if getattr(original, "_is_patched", False):
+        return
+
+    @functools.wraps(original)
+    def from_pretrained(cls: type[TrainPipelineConfig], pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
+        path = configs.path_of(str(pretrained_name_or_path)) or pretrained_name_or_path
+        return original.__func__(cls, path, **kwargs)
+
+    from_pretrained._is_patched = True  # type: ignore[attr-defined]
+    TrainPipelineConfig.from_pretrained = classmethod(from_pretrained)
+
+
 def read_in_batches() -> None:
     """Training reads datasets without cameras in batches. LeRobot reads row by row (issues 2315, 2895, 4392).
 
@@ -150,7 +167,7 @@ def _is_given(option: str) -> bool:
     path = parser.parse_arg("config_path")
     if path is None:
         return False
-    file = Path(path)
+    file = configs.path_of(path) or Path(path)
     if file.is_dir():
         file /= "train_config.json"
     if not file.is_file():  # from the Hub: a whole configuration, which holds every option
