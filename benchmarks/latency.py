@@ -51,9 +51,10 @@ def main() -> None:
     parser.add_argument("--draw_only", action="store_true", help="draw what was measured before")
     args = parser.parse_args()
     if not args.draw_only:
-        rows = list(measure_all(args))
-        with args.output.open("w", newline="") as file:
-            write_rows(rows, file)
+        unfinished = args.output.with_suffix(".unfinished")
+        with unfinished.open("w", newline="") as file:
+            write_rows(measure_all(args), file)
+        unfinished.replace(args.output)
     draw(args.output)
 
 
@@ -112,7 +113,7 @@ def make_rows(
             "ratio_to_uca_flow_by_the_same": f"{median / reference[entry.engine]:.1f}" if reference else "",
             "ratio_to_public_code": f"{median / PUBLIC_CODE[entry.name]:.2f}" if compared else "",
         }
-        print("  ".join(row.values()))
+        print(f"{entry.name:12}{entry.engine:10}{n_points:6} points {n_threads} threads {median:9.2f} ms")
         yield row
 
 
