@@ -128,7 +128,8 @@ class FlopCounter(TorchDispatchMode):
 def encode_only(policy: PointCloudPolicy, batch: dict[str, torch.Tensor], dtype: torch.dtype) -> torch.Tensor:
     """The observation features, in the precision of the step."""
     with torch.autocast(str(batch["action"].device.type), dtype=dtype, enabled=dtype is not torch.float32):
-        return policy._encode(policy.model, batch)
+        cloud = batch[OBS_POINT_CLOUD][..., : policy.config.n_points, :]
+        return policy.model.encoder(cloud, batch["observation.state"])
 
 
 if __name__ == "__main__":

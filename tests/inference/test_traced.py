@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import openvino
 import pytest
@@ -116,12 +117,37 @@ def test_threads_follow_the_work(monkeypatch):
 
 
 @every_runtime
-def test_one_function_serves_all_shapes(runtime):
+def test_one_function_serves_all_shapes_and_keeps_the_latest_traces(runtime):
     network, function = make_network(), runtime(call)
-    for shape in ((1, 3), (5, 3), (2, 7, 3), (1, 3)):
+    for shape in ((1, 3), (5, 3), (2, 7, 3), (1, 3), (6, 3), (7, 3)):
         x = torch.randn(shape)
         torch.testing.assert_close(function(network, x)[0], network(x).detach(), atol=1e-5, rtol=0)
-    assert len(function._traces) == 3
+    assert [shape for (shape,) in function._traces] == [(2, 7, 3), (1, 3), (6, 3), (7, 3)]
+
+
+@every_runtime
+def test_an_empty_batch_is_pytorchs(runtime):
+    """It ends the process in OpenVINO and in ONNX Runtime."""
+    network = make_network()
+    (result,) = runtime(call)(network, torch.zeros(0, 3))
+    assert result.shape == (0, 4)
+
+
+@every_runtime
+def test_two_networks_in_two_threads(runtime):
+    """Each thread with a function of its own; all of them trace at the same time, several shapes."""
+    networks = [make_network() for _ in range(2)]
+    x = torch.randn(4, 3)
+
+    def compute(network: nn.Module) -> list[torch.Tensor]:
+        function = runtime(call)
+        return [function(network, x[:size])[0] for _ in range(20) for size in (1, 2, 3, 4)]
+
+    with ThreadPoolExecutor(2) as pool:
+        results = list(pool.map(compute, networks))
+    for network, computed in zip(networks, results, strict=True):
+        for result in computed:
+            torch.testing.assert_close(result, network(x[: len(result)]).detach(), atol=1e-5, rtol=0)
 
 
 @every_runtime
@@ -143,7 +169,30 @@ def test_changed_weights_are_noticed(runtime):
         with torch.no_grad():
             network[-1].bias.add_(1)
 
-    for change in (optimizer.step, load, average, change_last):
+    def change_in_the_middle() -> None:
+        with torch.no_grad():
+            network[1].weight.mul_(2)
+
+    def replace_data() -> None:
+        network[1].weight.data = torch.rand(16)
+
+    def assign() -> None:
+        network.load_state_dict(make_network().state_dict(), assign=True)
+
+    def set_parameter() -> None:
+        network[0].weight = nn.Parameter(torch.rand(16, 3))
+
+    for change in (
+        optimizer.step,
+        load,
+        average,
+        change_last,
+        change_in_the_middle,
+        replace_data,
+        replace_data,
+        assign,
+        set_parameter,
+    ):
         (before,) = function(network, x)
         change()
         (after,) = function(network, x)

@@ -21,6 +21,7 @@ from lerobot_uca.meanflow import sample_intervals
 from lerobot_uca.networks import forward_mode
 from lerobot_uca.networks.conditioning import CONDITIONING
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from lerobot_uca.policies.inputs import is_finite
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 T = 4
@@ -136,15 +137,33 @@ def test_without_a_compiler():
         policy.predict_action_chunk(make_observation())
 
 
+@torch.no_grad()
+def average(policy):
+    policy.model.generator.head[-1].bias.fill_(1.0)
+    policy.update()
+
+
+def replace_one_weight(policy):
+    weight = policy.ema_model.generator.blocks[0].feed_forward[0].weight
+    weight.data = torch.full_like(weight, 0.1)
+
+
+def replace_all_weights(policy):
+    policy.ema_model.load_state_dict(
+        {key: value + 0.01 for key, value in policy.ema_model.state_dict().items()}, assign=True
+    )
+
+
+CHANGES = {3: replace_one_weight, 5: replace_all_weights, 7: average}
+
+
 def assert_acts_like_pytorch(fast, batch_size):
     reference = UCAFlowPolicy(dataclasses.replace(fast.config, inference="eager")).eval()
     reference.load_state_dict(fast.state_dict())
     for step in range(10):
-        if step == 7:  # another average: what was traced or compiled must follow
+        if step in CHANGES:  # traces and compiled code must follow
             for policy in (fast, reference):
-                with torch.no_grad():
-                    policy.model.generator.head[-1].bias.fill_(1.0)
-                policy.update()
+                CHANGES[step](policy)
         observation = make_observation(batch_size)
         noise = torch.randn(batch_size, fast.config.horizon, N_ACTIONS)
         actions = [policy.select_action(observation, noise=noise) for policy in (fast, reference)]
@@ -299,11 +318,15 @@ def test_averaged_weights_follow_the_stated_schedule():
     weight = policy.model.generator.embed_action.weight
     average = policy.ema_model.generator.embed_action.weight
     expected = average.clone()
-    for step in range(1, 4):
+    for decay in (
+        0,
+        0,
+        1 - 2**-0.75,
+        1 - 3**-0.75,
+    ):  # the baselines': of two updates that only copy, then step 1, 2, ...
         with torch.no_grad():
             weight.add_(1.0)
         policy.update()
-        decay = 1 - (1 + step) ** -0.75
         expected = decay * expected + (1 - decay) * weight
         torch.testing.assert_close(average, expected)
 
@@ -439,17 +462,10 @@ def test_a_checkpoint_of_another_policy_type(tmp_path):
         UCAFlowPolicy.from_pretrained(tmp_path)
 
 
-def test_finite_values_may_have_an_infinite_sum(policy):
+def test_finite_values_may_have_an_infinite_sum():
     cloud = torch.full((1, 1, N_POINTS, 3), 3e38)
     assert cloud.sum() == torch.inf
-    policy._check_finite({OBS_POINT_CLOUD: cloud}, [OBS_POINT_CLOUD])
-
-
-def test_observations_in_bfloat16(policy):
-    observation = {key: value.bfloat16() for key, value in make_observation().items()}
-    policy._check_finite(observation, observation)
-    with pytest.raises(UserError, match=r"'observation.state' must be finite, got 9 of 9"):
-        policy._check_finite({"observation.state": observation["observation.state"] * torch.nan}, ["observation.state"])
+    assert is_finite(cloud)
 
 
 def test_another_number_of_samples_needs_a_reset(policy):

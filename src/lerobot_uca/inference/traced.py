@@ -8,8 +8,10 @@ that no compiler is needed. Both read the ONNX model that PyTorch's tracing make
 
 import io
 import logging
+import threading
 import warnings
 from abc import ABC, abstractmethod
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from textwrap import shorten
 from typing import ClassVar
@@ -24,6 +26,11 @@ logger = logging.getLogger(__name__)
 OPSET = 17  # the first with LayerNormalization
 WEIGHTS_PER_THREAD = 900_000
 """A second thread pays from about twice so many weights, those of all samples of a batch counted together."""
+MAX_TRACES = 4
+"""Of a function, for the shapes used last: each one holds 10 to 20 MB and threads of its own."""
+
+_exporter = threading.Lock()
+"""PyTorch's exporter keeps its state in globals."""
 
 Run = Callable[[Sequence[Tensor]], tuple[Tensor, ...]]
 """A trace, opened by a runtime: float32 inputs to results."""
@@ -33,10 +40,9 @@ class TracedFunction(ABC):
     """A function of a network and of tensors, computed by a runtime instead of PyTorch.
 
     The network is traced, which takes about a second, when it is first called with inputs of new shapes, and again
-    when its first or last weight was changed in place. (PyTorch's fused optimisers change weights unseen: trace the
-    averaged ones, as the policies do.) The trace holds for all values of the inputs: the function must not branch on
-    them. What the runtime makes of it is compared with PyTorch once; where it differs or fails, PyTorch goes on. Not
-    for several threads at once.
+    when a weight was changed in place or replaced (`_Weights`). The trace holds for all values of the inputs: the
+    function must not branch on them. The runtime's results are compared with PyTorch's once; where they differ or the
+    runtime fails, PyTorch goes on. Each thread needs a function of its own.
 
     Args:
         eager: function(network, *inputs) in PyTorch: what is traced, and the reference. Returns a tuple.
@@ -49,9 +55,8 @@ class TracedFunction(ABC):
     def __init__(self, eager: Function) -> None:
         self.eager = eager
         self._network: nn.Module | None = None
-        self._watched: list[Tensor] = []
-        self._versions: list[int] = []
-        self._traces: dict[tuple[torch.Size, ...], Run] = {}
+        self._weights: _Weights | None = None
+        self._traces: OrderedDict[tuple[torch.Size, ...], Run] = OrderedDict()  # the latest used one is the last
 
     def __reduce__(self) -> tuple[type["TracedFunction"], tuple[Function]]:
         return type(self), (self.eager,)  # traces can be neither copied nor sent to another process
@@ -63,20 +68,20 @@ class TracedFunction(ABC):
     def __call__(self, network: nn.Module, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The same as `eager(network, *inputs)` up to rounding. Inputs are float32, the first dimension is the batch.
 
-        PyTorch computes on other devices than the CPU and while the network is trained.
+        PyTorch computes on other devices than the CPU, while the network is trained, and an empty batch, for which
+        the runtimes end the process.
         """
-        if network.training or inputs[0].device.type != "cpu":
+        if network.training or inputs[0].device.type != "cpu" or not len(inputs[0]):
             return self.eager(network, *inputs)
-        if network is not self._network or self._versions != [weight._version for weight in self._watched]:
-            self._network = network
-            # Two weights stand for all: averaging and loading change them together, and to look at a hundred takes 5 %
-            # of a small network's time. Those made in inference mode have no version: nothing trains them.
-            weights = [weight for weight in network.parameters() if not weight.is_inference()]
-            self._watched = [*weights[:1], *weights[-1:]]
-            self._versions = [weight._version for weight in self._watched]
+        if network is not self._network or self._weights is None or self._weights.have_changed():
+            self._network, self._weights = network, _Weights(network)
             self._traces.clear()
         shapes = tuple(tensor.shape for tensor in inputs)
-        if shapes not in self._traces:
+        if shapes in self._traces:
+            self._traces.move_to_end(shapes)
+        else:
+            if len(self._traces) == MAX_TRACES:
+                self._traces.popitem(last=False)
             self._traces[shapes] = self._trace(network, shapes)
         return self._traces[shapes](inputs)
 
@@ -110,6 +115,36 @@ class TracedFunction(ABC):
         return bool((result - expected).abs().max() <= self.tolerance * expected.abs().max())
 
 
+class _Weights:
+    """A network's weights, to notice when one is changed in place or replaced, by `weight.data = ...` for example.
+
+    All are looked at, in every call: 3 % of a small network's time. Two things stay unnoticed: PyTorch's fused
+    optimisers, which change weights in place without a trace of it (so the policies compute with averaged weights),
+    and whole submodules that are replaced.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        self._seen = []
+        self._kept = []  # as long as a storage is kept, no other one has its address
+        for module in network.modules():
+            for name, weight in module._parameters.items():
+                if weight is not None:
+                    # Weights made in inference mode count no changes: nothing trains them.
+                    version = None if weight.is_inference() else weight._version
+                    self._seen.append((module._parameters, name, weight.data_ptr(), version))
+                    self._kept.append(weight.detach())
+
+    def have_changed(self) -> bool:
+        """Whether any weight is not what it was."""
+        for owner, name, address, version in self._seen:
+            weight = owner.get(name)
+            if weight is None or weight.data_ptr() != address:
+                return True
+            if version is not None and weight._version != version:
+                return True
+        return False
+
+
 def to_onnx(
     function: Callable[..., Tensor | tuple[Tensor, ...]],
     network: nn.Module,
@@ -120,7 +155,13 @@ def to_onnx(
     """function(network, *inputs) of float32 inputs of the given shapes as an ONNX model."""
     file = io.BytesIO()
     # LeRobot calls policies in inference mode and under autocast; a trace must know neither.
-    with torch.inference_mode(False), torch.no_grad(), torch.autocast("cpu", enabled=False), warnings.catch_warnings():
+    with (
+        _exporter,
+        torch.inference_mode(False),
+        torch.no_grad(),
+        torch.autocast("cpu", enabled=False),
+        warnings.catch_warnings(),
+    ):
         # PyTorch's newer exporter takes ten times as long and needs one more package; the older one warns of its age
         # and of sizes becoming constants, which they are.
         warnings.simplefilter("ignore")

@@ -63,7 +63,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). LeRobot also evaluates with it
     # during training; lerobot-eval uses float32 unless told policy.use_amp=true.
     dtype: str = "float32"
-    # The averaged weights follow with decay 1 - (1 + step)^-ema_power ...
+    # The averaged weights follow with decay 1 - (1 + step)^-ema_power, step 0 at the first two updates as in the
+    # baselines' code ...
     ema_power: float = 0.75
     # ... but at most this one.
     ema_max_decay: float = 0.9999

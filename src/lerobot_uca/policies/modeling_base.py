@@ -5,19 +5,18 @@ A method adds its own network, loss and sampler.
 Letters: B samples, O observation steps, N points, S state dimensions, T horizon, A action dimensions, F features.
 """
 
-import math
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from textwrap import shorten
-from typing import Any, NamedTuple, NoReturn, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
@@ -25,11 +24,12 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference.backends import make_backend
 from lerobot_uca.networks.observation_encoder import ObservationEncoder
-from lerobot_uca.policies import processor_base  # noqa: F401 (registers the steps that checkpoints name)
+from lerobot_uca.policies import (
+    inputs,
+    processor_base,  # noqa: F401 (registers the steps that checkpoints name)
+)
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.history import Frame, ObservationHistory
-
-OBSERVATION_KEYS = (OBS_POINT_CLOUD, OBS_STATE)
 
 
 class Model(nn.Module):
@@ -109,31 +109,39 @@ class PointCloudPolicy(PreTrainedPolicy):
                 padding, action_is_pad (B, T). Padded steps do not count.
 
         Raises:
-            UserError: for wrong shapes, and for NaN or infinite values.
+            UserError: for wrong shapes, and if the loss is NaN or infinite: naming the input that is, or is huge.
         """
         if reduction not in ("mean", "none"):
             raise UserError(f"reduction must be 'mean' or 'none', got '{reduction}'.")
-        self._check_shapes(batch, self.config.n_obs_steps)
-        x = batch[ACTION]
-        expected = (self.config.horizon, self.config.n_actions)
-        if x.shape[1:] != expected:
-            raise UserError(f"'{ACTION}' must have shape (B, {expected[0]}, {expected[1]}), got {tuple(x.shape)}.")
-        padded = batch.get(f"{ACTION}_is_pad")
-        mask = torch.ones(x.shape[:2], dtype=torch.bool, device=x.device) if padded is None else ~padded
+        observations = self._read(batch, self.config.n_obs_steps)
+        x = inputs.as_float32(ACTION, inputs.get(batch, ACTION), self.ema_step.device)
+        inputs.check_shape(ACTION, x, (len(observations.state), self.config.horizon, self.config.n_actions))
+        mask = self._mask(batch, x)
         model = self.active_model
-        loss = self.compute_loss(model.generator, x, self._encode(model, batch), mask)
+        loss = self.compute_loss(model.generator, x, model.encoder(*observations), mask)
         parts = {name: value.mean().item() for name, value in loss.parts.items()}
         mean = loss.total.mean()
         if not torch.isfinite(mean):
-            self._check_finite(batch, (*OBSERVATION_KEYS, ACTION))
-            self._raise_diverged()
+            observations.checked()
+            inputs.check_values(ACTION, x)
+            raise self._diverged()
         return (mean if reduction == "mean" else loss.total), parts
+
+    def _mask(self, batch: Mapping[str, Tensor], x: Tensor) -> Tensor:
+        """True (B, T) for the actions that count."""
+        key = f"{ACTION}_is_pad"
+        if batch.get(key) is None:
+            return torch.ones(x.shape[:2], dtype=torch.bool, device=x.device)
+        is_pad = inputs.as_float32(key, batch[key], x.device)
+        inputs.check_shape(key, is_pad, tuple(x.shape[:2]))
+        return is_pad == 0
 
     @torch.no_grad()
     def update(self) -> None:
         """Let the averaged weights follow; LeRobot calls it after each optimiser step."""
         self.ema_step += 1
-        decay = min(1 - (1 + self.ema_step.item()) ** -self.config.ema_power, self.config.ema_max_decay)
+        step = max(0, self.ema_step.item() - 2)  # as the baselines count: the first two updates copy the weights
+        decay = min(1 - (1 + step) ** -self.config.ema_power, self.config.ema_max_decay)
         torch._foreach_lerp_(list(self.ema_model.parameters()), list(self.model.parameters()), 1 - decay)
 
     # Inference --------------------------------------------------------------------------------------------------
@@ -154,7 +162,7 @@ class PointCloudPolicy(PreTrainedPolicy):
         """
         frame = self._remember(batch)
         if not self._action_queue:
-            self._action_queue.extend(self._plan_from_remembered(noise).unbind(dim=1))
+            self._action_queue.extend(self._plan_from(self._history.observed, noise).unbind(dim=1))
         elif self._history.is_seen_again(len(self._action_queue), self.config.n_action_steps):
             self._features(frame)  # now, so that the plan itself takes less time
         return self._action_queue.popleft()
@@ -168,33 +176,28 @@ class PointCloudPolicy(PreTrainedPolicy):
                 next call, or the observed steps, (B, O, N, 3) and (B, O, S), oldest first, which are not.
             noise: (B, T, A), drawn if not given.
         """
-        if _get(batch, OBS_POINT_CLOUD).ndim == 3:
+        if np.ndim(inputs.get(batch, OBS_POINT_CLOUD)) != 4:
             self._remember(batch)
-            return self._plan_from_remembered(noise)
-        self._check_shapes(batch, self.config.n_obs_steps)
-        self._check_finite(batch, OBSERVATION_KEYS)
-        cloud, state = batch[OBS_POINT_CLOUD][..., : self.config.n_points, :], batch[OBS_STATE]
-        earlier: tuple[Tensor, ...] = ()
-        if self.config.n_obs_steps > 1:
-            (features,) = self._encode_frames(self.active_model.encoder, cloud[:, :-1], state[:, :-1])
-            earlier = features.split(1, dim=1)
-        return self._plan_from(Frame(cloud[:, -1:], state[:, -1:]), earlier, noise)
+            return self._plan_from(self._history.observed, noise)
+        cloud, state = self._read(batch, self.config.n_obs_steps).checked()
+        pairs = zip(cloud.split(1, dim=1), state.split(1, dim=1), strict=True)
+        return self._plan_from([Frame(*pair) for pair in pairs], noise)
 
     @property
     def active_model(self) -> Model:
         """The trained model in training mode, its moving average in eval mode."""
         return self.model if self.training else self.ema_model
 
+    def _read(self, batch: Mapping[str, Tensor], n_obs: int | None) -> inputs.Observations:
+        return inputs.read_observations(batch, self.config, self.ema_step.device, n_obs=n_obs)
+
     def _remember(self, batch: Mapping[str, Tensor]) -> Frame:
-        observation = {key: _get(batch, key)[:, None] for key in OBSERVATION_KEYS}
-        self._check_shapes(observation, n_obs=1)
-        self._check_finite(observation, OBSERVATION_KEYS)
-        if self._history.batch_size not in (None, len(observation[OBS_STATE])):
+        cloud, state = self._read(batch, None).checked()
+        if self._history.batch_size not in (None, len(state)):
             raise UserError(
-                f"The batch must have {self._history.batch_size} samples, as since the last reset(), "
-                f"got {len(observation[OBS_STATE])}."
+                f"The batch must have {self._history.batch_size} samples, as since the last reset(), got {len(state)}."
             )
-        frame = Frame(observation[OBS_POINT_CLOUD][..., : self.config.n_points, :], observation[OBS_STATE])
+        frame = Frame(cloud[:, None], state[:, None])
         self._history.append(frame)
         return frame
 
@@ -203,17 +206,20 @@ class PointCloudPolicy(PreTrainedPolicy):
             (frame.features,) = self._encode_frames(self.active_model.encoder, frame.cloud, frame.state)
         return frame.features
 
-    def _plan_from_remembered(self, noise: Tensor | None) -> Tensor:
-        *earlier, newest = self._history.observed
-        return self._plan_from(newest, map(self._features, earlier), noise)
-
-    def _plan_from(self, newest: Frame, earlier: Iterable[Tensor], noise: Tensor | None) -> Tensor:
+    def _plan_from(self, observed: Sequence[Frame], noise: Tensor | None) -> Tensor:
+        *earlier, newest = observed
+        shape = (len(newest.state), self.config.horizon, self.config.n_actions)
         if noise is None:
-            size = (len(newest.state), self.config.horizon, self.config.n_actions)
-            noise = torch.randn(size, device=newest.state.device)
-        actions, newest.features = self._plan(self.active_model, newest.cloud, newest.state, noise, *earlier)
-        if not _is_finite(actions):  # a robot must never get them
-            self._raise_diverged()
+            noise = torch.randn(shape, device=newest.state.device)
+        else:
+            noise = inputs.as_float32("noise", noise, newest.state.device)
+            inputs.check_shape("noise", noise, shape)
+            inputs.check_values("noise", noise)
+        actions, newest.features = self._plan(
+            self.active_model, newest.cloud, newest.state, noise, *map(self._features, earlier)
+        )
+        if not inputs.is_finite(actions):  # a robot must never get them
+            raise self._diverged()
         return actions
 
     def _encode_and_generate(
@@ -227,33 +233,10 @@ class PointCloudPolicy(PreTrainedPolicy):
         actions = self.generate(model.generator, noise, torch.cat([*earlier, newest], dim=1))
         return actions[:, self.config.executed], newest
 
-    def _encode(self, model: Model, batch: Mapping[str, Tensor]) -> Tensor:
-        cloud = batch[OBS_POINT_CLOUD][..., : self.config.n_points, :]
-        return model.encoder(cloud, batch[OBS_STATE])
-
-    # Bad input --------------------------------------------------------------------------------------------------
-
-    def _check_shapes(self, batch: Mapping[str, Tensor], n_obs: int) -> None:
-        cloud, state = _get(batch, OBS_POINT_CLOUD), _get(batch, OBS_STATE)
-        n_points = self.config.n_points or 1
-        if cloud.ndim != 4 or cloud.shape[1] != n_obs or cloud.shape[2] < n_points or cloud.shape[3] != 3:
-            raise UserError(
-                f"'{OBS_POINT_CLOUD}' must have shape (B, {n_obs}, N, 3) with N at least {n_points}, "
-                f"got {tuple(cloud.shape)}."
-            )
-        expected = (len(cloud), n_obs, self.config.n_states)
-        if tuple(state.shape) != expected:
-            raise UserError(f"'{OBS_STATE}' must have shape {expected}, got {tuple(state.shape)}.")
-
-    def _check_finite(self, batch: Mapping[str, Tensor], keys: Iterable[str]) -> None:
-        for key in keys:
-            if not _is_finite(batch[key]):
-                n_bad = int((~torch.isfinite(batch[key])).sum())
-                raise UserError(f"'{key}' must be finite, got {n_bad} of {batch[key].numel()} values NaN or infinite.")
-
-    def _raise_diverged(self) -> NoReturn:
-        raise FloatingPointError(
-            f"Policy '{self.name}' made NaN or infinite values from finite observations: the training diverged."
+    def _diverged(self) -> UserError:
+        return UserError(
+            f"Policy '{self.name}' computes NaN or infinite values from good inputs: its training diverged. Go back to "
+            "an earlier checkpoint, or train with a lower policy.optimizer_lr."
         )
 
     # Checkpoints ------------------------------------------------------------------------------------------------
@@ -280,22 +263,5 @@ class PointCloudPolicy(PreTrainedPolicy):
             ) from error
 
 
-def _get(batch: Mapping[str, Tensor], key: str) -> Tensor:
-    if key not in batch:
-        raise UserError(f"The batch must hold '{key}', got {', '.join(batch) or 'nothing'}.")
-    return batch[key]
-
-
 def _encode_frames(encoder: nn.Module, cloud: Tensor, state: Tensor) -> tuple[Tensor]:
     return (encoder(cloud, state),)
-
-
-def _is_finite(values: Tensor) -> bool:
-    """Whether all values are finite. A finite sum, one operation instead of five, shows it; it may also overflow.
-
-    On a CPU NumPy sums: of 64 clouds PyTorch's sum wakes a second thread, which then spins on a core the network needs.
-    """
-    for_numpy = values.device.type == "cpu" and values.dtype is not torch.bfloat16
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = values.detach().numpy().sum() if for_numpy else values.sum()
-    return math.isfinite(total) or bool(torch.isfinite(values).all())
