@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -158,7 +159,7 @@ def test_a_processor_step_that_a_trace_would_not_hold_for(tmp_path):
 
 @pytest.mark.parametrize("name", ["nowhere/at/all", "no-such-user/no-such-policy"])
 def test_a_checkpoint_that_is_nowhere(tmp_path, name):
-    with pytest.raises(UserError, match=f"'{name}' is no folder and not to be had from the Hub"):
+    with pytest.raises(UserError, match=f"'{name}' is not a folder and could not be downloaded from the Hub"):
         export(name, tmp_path / "policy.onnx")
 
 
@@ -188,6 +189,7 @@ def test_an_onnxruntime_that_is_too_old(exported, monkeypatch):
         (np.zeros((N_POINTS, 3)), np.zeros(2), r"'state' must have shape \(9,\), got \(2,\)"),
         (np.full((N_POINTS, 3), np.nan), np.zeros(N_STATES), "'point_cloud' must be finite"),
         (np.zeros((N_POINTS, 3)), np.full(N_STATES, np.inf), "'state' must be finite"),
+        (np.zeros((N_POINTS, 3)), np.full(N_STATES, 1e30), r"'state' must lie within \+-1e\+12, got 1\.0e\+30"),
     ],
 )
 def test_observations_that_do_not_fit(exported, point_cloud, state, message):
@@ -195,8 +197,78 @@ def test_observations_that_do_not_fit(exported, point_cloud, state, message):
         OnnxPolicy(exported).select_action(point_cloud, state)
 
 
-def test_a_file_that_is_no_policy(tmp_path):
+def test_a_model_with_other_inputs(tmp_path):
     network = torch.nn.Linear(3, 3)
     torch.onnx.export(network, torch.zeros(3), str(tmp_path / "other.onnx"), dynamo=False, input_names=["x"])
     with pytest.raises(ValueError, match=r"must have the inputs point_cloud, state, noise, got x"):
         OnnxPolicy(tmp_path / "other.onnx")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("point_cloud", np.zeros((1, N_POINTS, 3)), r"'point_cloud' must have shape \(2, 32, 3\), got \(1, 32, 3\)"),
+        ("point_cloud", np.full((2, N_POINTS, 3), np.nan), "'point_cloud' must be finite"),
+        ("state", np.zeros(N_STATES), r"'state' must have shape \(2, 9\), got \(9,\)"),
+        ("state", np.full((2, N_STATES), -1e30), "'state' must lie within"),
+        ("noise", np.zeros((4, 1)), r"'noise' must have shape \(4, 4\), got \(4, 1\)"),
+        ("noise", np.full((4, N_ACTIONS), np.inf), "'noise' must be finite"),
+    ],
+)
+def test_plans_from_inputs_that_do_not_fit(exported, name, value, message):
+    steps = {"point_cloud": np.zeros((2, N_POINTS, 3)), "state": np.zeros((2, N_STATES)), "noise": None}
+    with pytest.raises(ValueError, match=message):
+        OnnxPolicy(exported).plan(*{**steps, name: value}.values())
+
+
+def test_inputs_of_other_dtypes_are_computed_in_float32(exported):
+    random = np.random.default_rng(0)
+    inputs = [random.normal(size=size).astype(np.float32) for size in ((2, N_POINTS, 3), (2, N_STATES), (4, N_ACTIONS))]
+    policy = OnnxPolicy(exported)
+    expected = policy.plan(*inputs)
+    np.testing.assert_array_equal(policy.plan(*(values.astype(np.float64) for values in inputs)), expected)
+
+
+class Diverged(torch.nn.Module):
+    def forward(self, point_cloud, state, noise):
+        return (noise + point_cloud.sum() + state.sum()) * torch.inf
+
+
+def test_actions_that_are_not_finite_are_never_handed_out(tmp_path):
+    shapes = {"point_cloud": (2, N_POINTS, 3), "state": (2, N_STATES), "noise": (4, N_ACTIONS)}
+    inputs = tuple(torch.zeros(shape) for shape in shapes.values())
+    torch.onnx.export(Diverged(), inputs, str(tmp_path / "policy.onnx"), dynamo=False, input_names=list(shapes))
+    with pytest.raises(ValueError, match="The actions are NaN or infinite, the inputs are not"):
+        OnnxPolicy(tmp_path / "policy.onnx").select_action(np.zeros((N_POINTS, 3)), np.zeros(N_STATES))
+
+
+def test_a_policy_whose_training_diverged_is_not_exported(tmp_path):
+    policy = save(tmp_path)
+    with torch.no_grad():
+        policy.ema_model.generator.head[-1].bias.fill_(torch.inf)
+    policy.save_pretrained(tmp_path)
+    with pytest.raises(UserError, match="its training diverged"):
+        export(str(tmp_path), tmp_path / "policy.onnx")
+    assert not (tmp_path / "policy.onnx").exists()
+
+
+@pytest.mark.parametrize("location", ["../secret", "weights.bin"])
+def test_a_file_with_weights_in_other_files(exported, tmp_path, location):
+    """They may be any files of the machine, and one file is what an export writes."""
+    (tmp_path / "secret").write_bytes(bytes(10**6))
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "weights.bin").write_bytes(bytes(10**6))
+    model = onnx.load(exported)
+    weight = model.graph.initializer[0]
+    weight.data_location = onnx.TensorProto.EXTERNAL
+    weight.ClearField("raw_data")
+    weight.external_data.add(key="location", value=location)
+    (tmp_path / "folder" / "policy.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(ValueError, match=r"policy\.onnx' keeps weights in other files \(external data\)"):
+        OnnxPolicy(tmp_path / "folder" / "policy.onnx")
+
+
+def test_a_file_that_is_not_a_model(tmp_path):
+    (tmp_path / "policy.onnx").write_bytes(b"text")
+    with pytest.raises(ValueError, match=r"policy\.onnx' cannot be opened as an ONNX model"):
+        OnnxPolicy(tmp_path / "policy.onnx")

@@ -6,6 +6,7 @@ from lerobot.envs import make_env, make_env_config, preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
+from lerobot_uca.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -71,3 +72,11 @@ def rollout(env: PointCloudEnv, seed: int, n_steps: int = 3) -> list[np.ndarray]
         observation, reward, *_ = env.step(rng.uniform(-1, 1, env.n_actions).astype(np.float32))
         arrays += [observation["point_cloud"], observation["agent_pos"], np.array(reward)]
     return arrays
+
+
+@pytest.mark.parametrize("kind", ["metaworld_pointcloud", "adroit_pointcloud"])
+def test_tasks_in_threads_would_share_the_policys_memory(kind):
+    config = make_env_config(kind, max_parallel_tasks=2)
+    for start in (config.get_env_processors, lambda: make_env(config)):  # of training and of evaluation
+        with pytest.raises(UserError, match=r"env\.max_parallel_tasks must be 1, got 2: .* share one policy"):
+            start()

@@ -490,7 +490,7 @@ def test_a_bad_frame_is_neither_remembered_nor_a_reason_to_forget(policy):
 @pytest.mark.parametrize(
     ("key", "shape", "message"),
     [
-        (OBS_POINT_CLOUD, (N_POINTS, 4), r"must have shape \(N, 3\)"),
+        (OBS_POINT_CLOUD, (N_POINTS, 2), r"must have shape \(N, 3\)"),
         ("observation.state", (3, 3), r"must be a vector, got shape \(3, 3\)"),
     ],
 )

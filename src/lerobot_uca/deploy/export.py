@@ -18,6 +18,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
+from lerobot_uca.deploy.onnx_runner import open_session
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference.traced import to_onnx
@@ -128,7 +129,9 @@ def _folder(checkpoint: str) -> Path:
             folder = Path(snapshot_download(checkpoint, allow_patterns=["*.json", "*.safetensors"]))
         except (HFValidationError, HfHubHTTPError, LocalEntryNotFoundError) as error:
             reason = " ".join(str(error).split())
-            raise UserError(f"'{checkpoint}' is no folder and not to be had from the Hub: {reason}") from error
+            raise UserError(
+                f"'{checkpoint}' is not a folder and could not be downloaded from the Hub: {reason}"
+            ) from error
     for name in FILES:
         if not (folder / name).is_file():
             raise UserError(
@@ -141,7 +144,7 @@ def _folder(checkpoint: str) -> Path:
 def _check_same_actions(model: bytes, raw_policy: RawPolicy) -> None:
     random = np.random.default_rng(0)
     inputs = {name: random.normal(size=shape).astype(np.float32) for name, shape in raw_policy.input_shapes.items()}
-    (exported,) = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"]).run(None, inputs)
+    (exported,) = open_session(model, "the exported policy").run(None, inputs)
     with torch.no_grad():
         expected = raw_policy.act(raw_policy.policy, *map(torch.from_numpy, inputs.values())).numpy()
     difference = np.abs(exported - expected).max() / np.abs(expected).max()

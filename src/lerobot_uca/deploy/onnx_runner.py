@@ -16,6 +16,7 @@ import onnxruntime
 
 INPUTS = ("point_cloud", "state", "noise")
 MIN_ONNXRUNTIME = (1, 12)  # the first with opset 17
+LARGEST = 1e12  # of far larger values onnxruntime makes NaN or arbitrary actions, since their squares are infinite
 
 
 class OnnxPolicy:
@@ -27,16 +28,13 @@ class OnnxPolicy:
         n_threads: cores to use; 0 for all. A small network is fastest with one.
 
     Raises:
-        ValueError: if the file is not such a policy, or if an observation has a wrong shape or is not finite.
+        ValueError: if the file is not such a policy or keeps weights in other files; if an observation has a wrong
+            shape, if it is not finite or huge, or if an action is not finite.
         RuntimeError: if onnxruntime is too old.
     """
 
     def __init__(self, path: str | Path, seed: int | None = None, n_threads: int = 1) -> None:
-        check_version(onnxruntime.__version__)
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = n_threads
-        options.add_session_config_entry("session.force_spinning_stop", "1")  # between calls the cores belong to others
-        self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        self._session = open_session(Path(path).read_bytes(), str(path), n_threads)
         shapes = {tensor.name: tuple(tensor.shape) for tensor in self._session.get_inputs()}
         if set(shapes) != set(INPUTS):
             raise ValueError(f"'{path}' must have the inputs {', '.join(INPUTS)}, got {', '.join(shapes)}.")
@@ -57,10 +55,8 @@ class OnnxPolicy:
         The cloud is (N, 3). Of one with more channels the first three are taken as xyz; one with more points is sampled
         farthest point by farthest point, as the policy does.
         """
-        frame = (
-            _checked("point_cloud", _sampled(point_cloud, self._cloud_shape[0]), self._cloud_shape),
-            _checked("state", state, self._state_shape),
-        )
+        cloud = _sampled(point_cloud, self._cloud_shape[0])
+        frame = (_checked("point_cloud", cloud, self._cloud_shape), _checked("state", state, self._state_shape))
         self._history.extend([frame] * (1 if self._history else self._n_steps))
         if not self._action_queue:
             clouds, states = zip(*self._history, strict=True)
@@ -71,13 +67,35 @@ class OnnxPolicy:
         """Actions (n_action_steps, A), to be executed from now on, from the latest steps, oldest first.
 
         Args:
-            point_clouds: (K, N, 3) float32.
-            states: (K, S) float32.
-            noise: (T, A) float32, Gaussian; drawn if not given.
+            point_clouds: (K, N, 3).
+            states: (K, S).
+            noise: (T, A), Gaussian; drawn if not given.
         """
         if noise is None:
             noise = self._random.standard_normal(self._noise_shape, dtype=np.float32)
-        return self._session.run(None, {"point_cloud": point_clouds, "state": states, "noise": noise})[0]
+        values = {
+            "point_cloud": _checked("point_cloud", point_clouds, (self._n_steps, *self._cloud_shape)),
+            "state": _checked("state", states, (self._n_steps, *self._state_shape)),
+            "noise": _checked("noise", noise, self._noise_shape),
+        }
+        (actions,) = self._session.run(None, values)
+        if not np.isfinite(actions).all():  # a robot must never get them
+            raise ValueError("The actions are NaN or infinite, the inputs are not: the policy's training diverged.")
+        return actions
+
+
+def open_session(model: bytes, name: str, n_threads: int = 1) -> onnxruntime.InferenceSession:
+    """Open an ONNX model; a `ValueError` if parts of it lie in other files, which may be any files of the machine."""
+    check_version(onnxruntime.__version__)
+    if b"location" in model:  # ONNX's word before the path of a weight's file; an exported policy is one file
+        raise ValueError(f"'{name}' keeps weights in other files (external data). A policy must be one file.")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = n_threads
+    options.add_session_config_entry("session.force_spinning_stop", "1")  # between calls the cores belong to others
+    try:
+        return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has a class for each reason, and no common one
+        raise ValueError(f"'{name}' cannot be opened as an ONNX model: {error}") from error
 
 
 def check_version(version: str) -> None:
@@ -108,4 +126,6 @@ def _checked(name: str, value: np.ndarray, shape: tuple[int, ...] | list[int]) -
         raise ValueError(f"'{name}' must have shape {tuple(shape)}, got {array.shape}.")
     if not np.isfinite(array).all():
         raise ValueError(f"'{name}' must be finite, got NaN or infinite values.")
+    if np.abs(array).max() > LARGEST:
+        raise ValueError(f"'{name}' must lie within +-{LARGEST:.0e}, got {np.abs(array).max():.1e}.")
     return array

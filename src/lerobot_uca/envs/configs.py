@@ -73,6 +73,11 @@ class PointCloudEnvConfig(EnvConfig):
             raise UserError(f"env.n_points must be at least 1, got {self.n_points}.")
         if self.fps != type(self).fps:  # datasets would tell the wrong time
             raise UserError(f"env.fps of {self.type} is {type(self).fps}, the simulation's own; got {self.fps}.")
+        if self.max_parallel_tasks != 1:
+            raise UserError(
+                f"env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: LeRobot's parallel tasks are "
+                "threads that share one policy, which remembers one episode. eval.batch_size runs episodes at once."
+            )
         self.tasks()
 
     @override
