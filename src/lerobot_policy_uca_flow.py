@@ -24,6 +24,8 @@ for _part in (
     "policies.processor_base",
     "envs.configs",
     "robots.ur5e.config_ur5e_follower",
+    "robots.ur5e.sim.config_simulated_camera",
+    "robots.ur5e.sim.config_scripted_teleoperator",
 ):
     _load(_part)
 

@@ -67,6 +67,7 @@ def test_only_our_console_commands_are_installed():
         "lerobot-uca-calibrate",
         "lerobot-uca-collect",
         "lerobot-uca-export",
+        "lerobot-uca-ur5e-sim",
     }
 
 

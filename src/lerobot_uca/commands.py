@@ -53,3 +53,14 @@ def benchmark() -> None:
         main()
     except UserError as error:
         sys.exit(f"error: {error}")
+
+
+def ur5e_sim() -> None:
+    """`lerobot-uca-ur5e-sim`."""
+    from lerobot_uca.errors import UserError
+    from lerobot_uca.robots.ur5e.sim.command import main
+
+    try:
+        main()
+    except UserError as error:
+        sys.exit(f"error: {error}")

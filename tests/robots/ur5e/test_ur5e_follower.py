@@ -120,7 +120,7 @@ def test_the_first_action_is_eased_to_and_far_ones_are_clipped_and_said(controll
         fastest.append(speed(controller))
         thread.join(0.01)
     assert max(fastest) < robot.config.ease_velocity * 1.2
-    assert np.abs(controller.robot.target_q - target).max() < 0.05
+    assert np.abs(controller.robot.arm.q - target).max() < 4e-3
     assert "0.60 rad away (shoulder_pan): easing there" in caplog.text
     commanded = robot.send_action(action_at(target + 1.0))
     step = np.array([commanded[key] for key in JOINT_KEYS]) - target

