@@ -51,14 +51,14 @@ def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path
     address, _ = world
     scene = SceneClient(address)
     teleop = ScriptedTeleoperatorConfig(
-        ip=address, task=TASK, fps=FPS, episode_time_s=4, reset_time_s=2, seed=5, calibration_dir=tmp_path
+        ip=address, task=TASK, fps=FPS, episode_time_s=5, reset_time_s=2, seed=5, calibration_dir=tmp_path
     )
     dataset_config = DatasetRecordConfig(
         repo_id="test/ur5e",
         root=tmp_path / "data",
         single_task="Close the drawer.",
         fps=FPS,
-        episode_time_s=4,
+        episode_time_s=5,
         reset_time_s=2,
         num_episodes=2,
         video=False,

@@ -39,6 +39,7 @@ class ScriptedTeleoperator(Teleoperator):
         self._episode = -1
         self._is_demonstrating = False
         self._began = -np.inf
+        self._n_sent = 0
         self._path: Array = np.array([[*HOME, 0.0]])
         self._last: Array = self._path[-1]
 
@@ -81,9 +82,11 @@ class ScriptedTeleoperator(Teleoperator):
         lasts = config.episode_time_s if self._is_demonstrating else config.reset_time_s
         if now - self._began > lasts - 0.5 / config.fps:
             self._begin_reset() if self._is_demonstrating else self._begin_demonstration()
-            self._began = now = self._clock()  # planning takes its time
-        row = self._path[min(round((now - self._began) * config.fps), len(self._path) - 1)]
-        self._last = row
+            self._began = self._clock()  # planning takes its time
+            self._n_sent = 0
+        # A row for each call, not for each moment: a computer that falls behind makes the motion slower, never jerky.
+        row = self._last = self._path[min(self._n_sent, len(self._path) - 1)]
+        self._n_sent += 1
         return dict(zip((*JOINT_KEYS, GRIPPER_KEY), row.tolist(), strict=True))
 
     def _begin_demonstration(self) -> None:
