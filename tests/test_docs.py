@@ -1,0 +1,159 @@
+"""The README and docs/: every command runs, in a tiny form, and every link leads somewhere.
+
+The commands run in this process, in the order of the pages and in one folder, as a reader would type them: what one
+command writes, a later one reads. A page's commands may be run alone with `-k`, if they need no other page's.
+"""
+
+import importlib.metadata
+import re
+import runpy
+import shlex
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+import pytest
+
+from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+NOT_RUN = {
+    "make quickstart": "the commands it prints are the README's, and benchmarks/results/ says what it reached",
+    "make test": "is what runs this",
+    "python3.12 -m venv": "installs",
+    "pip install": "installs",
+    "python benchmarks/learning.py": "collects, trains and evaluates for minutes, by the commands that are run here",
+    "python benchmarks/comparison.py --expert": "trains for three hours",
+}
+"""Beginnings of commands that cannot run here, and why."""
+
+# What is added to a command, or overrides it, to make it tiny.
+TINY_CLOUD = ["--env.n_points=32"]
+TINY_UCA_FLOW = ["--policy.dim=16", "--policy.n_layers=1", "--policy.n_heads=2", "--policy.n_points=16"]
+TINY_SIMPLE_DP3 = ["--policy.unet_widths=[16,32]", "--policy.point_widths=[16,32]", "--policy.n_points=16"]
+TINY = {
+    "lerobot-uca-collect": ["--n_episodes=1", *TINY_CLOUD],
+    "lerobot-train": ["--steps=2", "--batch_size=4", "--num_workers=0"],
+    "lerobot-eval": ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false", *TINY_CLOUD],
+    "lerobot-uca-export": [],
+    "benchmarks/comparison.py": [],
+    "benchmarks/control_loop.py": ["--steps=3", "--tasks", "dial-turn"],
+    "benchmarks/fit.py": [],
+    "benchmarks/inference.py": ["--calls=1", "--batch_sizes", "1", "--computed_by", "eager"],
+    "benchmarks/latency.py": [
+        *("--output=latency.csv", "--policies", "UCA-Flow", "--points", "32", "--threads", "1"),
+        *("--rounds=1", "--warm_up=1"),
+    ],
+    "benchmarks/point_cloud.py": ["--steps=1"],
+    "benchmarks/reading.py": ["--size=tiny", "--workers", "0"],
+    "benchmarks/training_step.py": ["--steps=1", "--batch_size=4", "--dim=16", "--n_points=16"],
+}
+
+
+def commands_of(page: Path) -> list[str]:
+    """The commands of a page's ```bash blocks, continued lines joined, without comments."""
+    commands = []
+    for block in re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+        for line in block.replace("\\\n", " ").splitlines():
+            command = shlex.join(shlex.split(line, comments=True))
+            commands += [command] if command else []
+    return commands
+
+
+COMMANDS = list(dict.fromkeys(command for page in PAGES for command in commands_of(page)))
+"""Each command once, in the order of the pages."""
+
+
+def plain(command: str) -> str:
+    """A command without quotes."""
+    return " ".join(shlex.split(command))
+
+
+def reason_not_to_run(command: str) -> str | None:
+    return next((reason for beginning, reason in NOT_RUN.items() if plain(command).startswith(beginning)), None)
+
+
+def tiny(command: str) -> tuple[str, list[str]]:
+    """The program or script, and its arguments with what makes it tiny."""
+    program, *arguments = shlex.split(command)
+    if program == "python":
+        program, *arguments = arguments
+    changes = list(TINY[program])
+    if program == "lerobot-train":
+        changes += TINY_SIMPLE_DP3 if "simple_dp3" in command else TINY_UCA_FLOW
+    return program, [*arguments, *changes]
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory) -> Path:
+    """A folder with the repository's scripts and, if they are there, Adroit's experts."""
+    folder = tmp_path_factory.mktemp("docs")
+    for name in ("benchmarks", "examples", "configs"):
+        (folder / name).symlink_to(ROOT / name)
+    experts = ROOT.parent / "shared" / "adroit_experts"
+    if experts.is_dir():
+        (folder / "experts").symlink_to(experts)
+        (folder / "door.npz").symlink_to(experts / "door.npz")
+    return folder
+
+
+def run(program: str) -> None:
+    """Run a console command or a script in this process."""
+    if program.endswith(".py"):
+        runpy.run_path(program, run_name="__main__")
+        return
+    (entry,) = importlib.metadata.entry_points(group="console_scripts", name=program)
+    entry.load()()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_runs(command, workspace, monkeypatch):
+    if reason := reason_not_to_run(command):
+        pytest.skip(reason)
+    program, arguments = tiny(command)
+    if ("door" in command or "experts/" in command) and not (workspace / "experts").exists():
+        pytest.skip("there are no Adroit experts")
+    mpl.use("Agg")
+    monkeypatch.chdir(workspace)
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    monkeypatch.setattr(sys, "argv", [program, *arguments])
+    monkeypatch.setattr(MetaworldPointCloudEnv, "_max_episode_steps", 5)
+    run(program)
+
+
+def test_no_reason_is_left_over():
+    for beginning in NOT_RUN:
+        assert any(plain(command).startswith(beginning) for command in COMMANDS), beginning
+
+
+def anchor(heading: str) -> str:
+    """A heading's anchor, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_to_files_and_headings(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith(("https://", "http://", "mailto:")):
+            continue
+        name, _, heading = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), f"{page.name}: {link}"
+        assert target.is_relative_to(ROOT), f"{page.name}: {link} leads out of the repository"
+        if heading:
+            anchors = {anchor(line) for line in re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)}
+            assert heading in anchors, f"{page.name}: {link}"
+
+
+def test_the_readme_is_short():
+    """It says what this is and where to go on; details have pages of their own."""
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs" / "README.md").read_text()
+    for page in PAGES[1:]:
+        assert page.name == "README.md" or f"({page.name})" in index, page.name
