@@ -16,14 +16,20 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 ALLOWED = {
     "inference": {"errors"},
     "objectives": {"meanflow", "networks"},
-    "policies": {"meanflow", "objectives", "networks", "inference", "point_clouds", "errors", "features", "registry"},
-    "envs": {"point_clouds", "errors", "features", "registry"},
-    "data": {"envs", "point_clouds", "errors", "features", "processes"},
+    "bounds": {"errors"},
+    "hub": {"errors"},
+    "policies": {
+        *("bounds", "meanflow", "objectives", "networks", "inference", "point_clouds"),
+        *("errors", "features", "hub", "registry"),
+    },
+    "envs": {"bounds", "point_clouds", "errors", "features", "registry"},
+    "data": {"bounds", "envs", "point_clouds", "errors", "features", "hub", "processes"},
     "robots": {"point_clouds", "errors", "features", "registry", "processes"},
     "visual": {"policies", "data", "envs", "point_clouds", "errors", "features"},
     "deploy": {"policies", "inference", "errors", "features"},
     "protocol": {"policies", "data", "envs", "errors", "features", "processes"},
-    "lerobot_patches": {"configs", "data", "policies", "errors", "features", "processes"},
+    "checkpoints": {"data", "errors"},
+    "lerobot_patches": {"checkpoints", "configs", "data", "policies", "errors", "features", "hub", "processes"},
     "commands": {"data", "deploy", "protocol", "robots", "visual", "errors", "processes"},
 }
 

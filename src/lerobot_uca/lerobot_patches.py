@@ -7,21 +7,32 @@ import functools
 import logging
 import os
 import sys
+from collections.abc import Callable
+from contextvars import ContextVar
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import lerobot
 import yaml
-from lerobot.configs import parser
+from lerobot.common import train_utils
+from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
+from lerobot.policies import factory as policy_factory
+from lerobot.processor import DataProcessorPipeline
+from lerobot.utils import utils
 
 from lerobot_uca import configs
+from lerobot_uca.checkpoints.resuming import cycle_exactly, without_trace
+from lerobot_uca.checkpoints.saving import save_whole, update_last
+from lerobot_uca.checkpoints.steps import check_steps
 from lerobot_uca.data.batched_dataset import BatchedDataset
-from lerobot_uca.errors import UserError
+from lerobot_uca.errors import UserError, reported
+from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.publishing import Evaluation, PublishedPolicy
 from lerobot_uca.processes import end_by_signals
 
 SUPPORTED_LEROBOT = "0.6.1"
@@ -36,10 +47,21 @@ def install() -> None:
     if Path(sys.argv[0]).stem.startswith("lerobot"):  # one of LeRobot's commands, not somebody's own program
         end_by_signals()
     shorten_decoder_warning()
-    if lerobot.__version__ == SUPPORTED_LEROBOT:
-        check_output_folders()
-        find_configs_by_name()
-        read_in_batches()
+    make_registered_steps_only()
+    if lerobot.__version__ != SUPPORTED_LEROBOT:
+        logger.warning(
+            "This package is made for LeRobot %s; this is %s. Checkpoints are not written whole, resuming does not "
+            "repeat an unbroken run and reading is slow. pip install lerobot==%s",
+            *(SUPPORTED_LEROBOT, lerobot.__version__, SUPPORTED_LEROBOT),
+        )
+        return
+    check_settings()
+    find_configs_by_name()
+    read_in_batches()
+    report_damaged_checkpoints()
+    save_checkpoints_whole()
+    resume_exactly()
+    report_failed_uploads()
 
 
 def report_user_errors() -> None:
@@ -86,19 +108,146 @@ def shorten_decoder_warning() -> None:
         target.addFilter(_DecoderWarning())
 
 
-def check_output_folders() -> None:
-    """A folder that cannot be written is refused at once. LeRobot finds out at the first checkpoint or video."""
+# What a checkpoint may do ---------------------------------------------------------------------------------------------
 
-    def check_training(config: TrainPipelineConfig) -> None:
-        if isinstance(config.policy, PointCloudPolicyConfig) and not config.job.is_remote:
-            check_output_folder(config.output_dir)
+_of_point_cloud_policy: ContextVar[bool] = ContextVar("of_point_cloud_policy", default=False)
 
-    def check_evaluation(config: EvalPipelineConfig) -> None:
-        if isinstance(config.policy, PointCloudPolicyConfig):
-            check_output_folder(config.output_dir)
 
-    _call_after(TrainPipelineConfig, "validate", check_training)
-    _call_after(EvalPipelineConfig, "__post_init__", check_evaluation)
+def make_registered_steps_only() -> None:
+    """No checkpoint can name code to run; see `checkpoints/steps.py`. LeRobot imports and calls whatever it names."""
+
+    def checked(build: Callable[..., Any]) -> Callable[..., Any]:
+        def build_steps(cls: type, loaded_config: dict[str, Any], overrides: dict[str, Any]) -> Any:
+            check_steps(loaded_config, of_point_cloud_policy=_of_point_cloud_policy.get())
+            return build(cls, loaded_config, overrides)
+
+        return build_steps
+
+    def known(make: Callable[..., Any]) -> Callable[..., Any]:
+        def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, *args: Any, **kwargs: Any) -> Any:
+            if pretrained_path is None or not isinstance(policy_cfg, PointCloudPolicyConfig):
+                return make(policy_cfg, pretrained_path, *args, **kwargs)
+            token = _of_point_cloud_policy.set(True)
+            try:
+                with reported(f"The processors of '{pretrained_path}' cannot be loaded"):
+                    return make(policy_cfg, pretrained_path, *args, **kwargs)
+            finally:
+                _of_point_cloud_policy.reset(token)
+
+        return make_pre_post_processors
+
+    _replace_class_method(DataProcessorPipeline, "_build_steps_from_config", checked)
+    _replace(policy_factory.make_pre_post_processors, known)
+
+
+def report_damaged_checkpoints() -> None:
+    """What is missing or damaged is named in one line. LeRobot shows a library's traceback."""
+
+    def policy(load: Callable[..., Any]) -> Callable[..., Any]:
+        def from_pretrained(cls: type, pretrained_name_or_path: Path | str, **kwargs: Any) -> Any:
+            with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded"):
+                return load(cls, pretrained_name_or_path, **kwargs)
+
+        return from_pretrained
+
+    def state(load: Callable[..., Any]) -> Callable[..., Any]:
+        def load_training_state(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> Any:
+            with reported(f"Training cannot go on from '{checkpoint_dir}'"):
+                return load(checkpoint_dir, *args, **kwargs)
+
+        return load_training_state
+
+    _replace_class_method(PreTrainedConfig, "from_pretrained", policy)
+    _replace(train_utils.load_training_state, state)
+
+
+def save_checkpoints_whole() -> None:
+    """See `checkpoints/saving.py`."""
+    _replace(train_utils.save_checkpoint, save_whole)
+    _replace(train_utils.update_last_checkpoint, update_last)
+
+
+def resume_exactly() -> None:
+    """See `checkpoints/resuming.py`."""
+    _replace(utils.cycle, cycle_exactly)
+    evaluation = sys.modules.get("lerobot.scripts.lerobot_eval")  # where training has it from
+    if evaluation is not None:
+        _replace(evaluation.eval_policy_all, lambda evaluate: _remember_success(without_trace(evaluate)))
+
+
+def _remember_success(evaluate: Callable[..., Any]) -> Callable[..., Any]:
+    """For the policy's page on the Hub."""
+
+    def eval_policy_all(*args: Any, **kwargs: Any) -> Any:
+        info = evaluate(*args, **kwargs)
+        policy = kwargs.get("policy")
+        if isinstance(policy, PublishedPolicy):
+            n_episodes = info["overall"]["n_episodes"]
+            policy.evaluation = Evaluation(info["overall"]["pc_success"], n_episodes, kwargs.get("start_seed"))
+        return info
+
+    return eval_policy_all
+
+
+def report_failed_uploads() -> None:
+    """A checkpoint that cannot be uploaded is a warning, a policy an error in one line. LeRobot ends in a traceback."""
+
+    def checkpoint(push: Callable[..., None]) -> Callable[..., None]:
+        def push_checkpoint_to_hub(checkpoint_dir: Path, repo_id: str, **kwargs: Any) -> None:
+            retry = upload_command(repo_id, checkpoint_dir, f"checkpoints/{checkpoint_dir.name}")
+            try:
+                with uploading(f"Checkpoint '{checkpoint_dir}'", retry):
+                    push(checkpoint_dir, repo_id, **kwargs)
+            except UserError as error:
+                logger.warning("%s", error)  # the training goes on
+
+        return push_checkpoint_to_hub
+
+    def processors(push: Callable[..., Any]) -> Callable[..., Any]:
+        def push_to_hub(self: DataProcessorPipeline, repo_id: str, **kwargs: Any) -> Any:
+            with uploading(f"Pipeline '{self.name}'", upload_command(repo_id, Path(".../last/pretrained_model"))):
+                return push(self, repo_id, **kwargs)
+
+        return push_to_hub
+
+    _replace(train_utils.push_checkpoint_to_hub, checkpoint)
+    _replace_method(DataProcessorPipeline, "push_to_hub", processors)
+
+
+# Folders and reading --------------------------------------------------------------------------------------------------
+
+
+def check_settings() -> None:
+    """A folder that cannot be written is refused at once, wrong settings in one line.
+
+    LeRobot finds the first out at the first checkpoint or video, and shows a traceback for the second.
+    """
+
+    def validated(validate: Callable[..., None]) -> Callable[..., None]:
+        def validate_and_check(self: TrainPipelineConfig) -> None:
+            try:
+                validate(self)
+            except (OSError, ValueError, NotImplementedError) as error:
+                if isinstance(error, UserError) or not isinstance(self.policy, PointCloudPolicyConfig):
+                    raise
+                raise UserError(" ".join(str(error).split())) from error
+            if isinstance(self.policy, PointCloudPolicyConfig):
+                self.policy.validate_sizes()  # before the dataset is read: a horizon of 10^9 would fill the memory
+                if not self.job.is_remote:
+                    check_output_folder(self.output_dir)
+
+        return validate_and_check
+
+    def made(make: Callable[..., None]) -> Callable[..., None]:
+        def make_and_check(self: EvalPipelineConfig) -> None:
+            make(self)
+            if isinstance(self.policy, PointCloudPolicyConfig):
+                check_output_folder(self.output_dir)
+
+        return make_and_check
+
+    _replace_method(TrainPipelineConfig, "validate", validated)
+    _replace_method(EvalPipelineConfig, "__post_init__", made)
 
 
 def check_output_folder(output_dir: Path | str | None) -> None:
@@ -114,17 +263,14 @@ def check_output_folder(output_dir: Path | str | None) -> None:
 
 def find_configs_by_name() -> None:
     """`--config_path=uca_flow_small` finds the file of that name in this package. LeRobot asks the Hub for it."""
-    original = TrainPipelineConfig.from_pretrained
-    if getattr(original, "_is_patched", False):
-        return
 
-    @functools.wraps(original)
-    def from_pretrained(cls: type[TrainPipelineConfig], pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
-        path = configs.path_of(str(pretrained_name_or_path)) or pretrained_name_or_path
-        return original.__func__(cls, path, **kwargs)
+    def named(load: Callable[..., Any]) -> Callable[..., Any]:
+        def from_pretrained(cls: type, pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
+            return load(cls, configs.path_of(str(pretrained_name_or_path)) or pretrained_name_or_path, **kwargs)
 
-    from_pretrained._is_patched = True  # type: ignore[attr-defined]
-    TrainPipelineConfig.from_pretrained = classmethod(from_pretrained)
+        return from_pretrained
+
+    _replace_class_method(TrainPipelineConfig, "from_pretrained", named)
 
 
 def read_in_batches() -> None:
@@ -176,16 +322,35 @@ def _is_given(option: str) -> bool:
     return isinstance(settings, dict) and option in settings
 
 
-def _call_after(owner: type, method: str, action: Any) -> None:
-    original = getattr(owner, method)
+# Replacing ------------------------------------------------------------------------------------------------------------
+
+Wrap = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""From what LeRobot has to what stands in its place."""
+
+
+def _wrapped(original: Callable[..., Any], wrap: Wrap) -> Callable[..., Any]:
+    new = functools.wraps(original)(wrap(original))
+    new._is_patched = True  # type: ignore[attr-defined]
+    return new
+
+
+def _replace(original: Callable[..., Any], wrap: Wrap) -> None:
+    """Replace a function in every module that has imported it by its name."""
     if getattr(original, "_is_patched", False):
         return
+    new = _wrapped(original, wrap)
+    for module in list(sys.modules.values()):
+        if getattr(module, "__dict__", {}).get(original.__name__) is original:
+            setattr(module, original.__name__, new)
 
-    @functools.wraps(original)
-    def patched(self: Any, *args: Any, **kwargs: Any) -> Any:
-        result = original(self, *args, **kwargs)
-        action(self)
-        return result
 
-    patched._is_patched = True  # type: ignore[attr-defined]
-    setattr(owner, method, patched)
+def _replace_method(owner: type, name: str, wrap: Wrap) -> None:
+    original = getattr(owner, name)
+    if not getattr(original, "_is_patched", False):
+        setattr(owner, name, _wrapped(original, wrap))
+
+
+def _replace_class_method(owner: type, name: str, wrap: Wrap) -> None:
+    original = getattr(owner, name).__func__
+    if not getattr(original, "_is_patched", False):
+        setattr(owner, name, classmethod(_wrapped(original, wrap)))

@@ -388,7 +388,7 @@ def test_preprocessing_of_a_loaded_checkpoint_equals_trainings(policy, tmp_path)
         ({"n_action_steps": 0}, "policy.n_action_steps must be at least 1, got 0"),
         ({"obs_stride": 0}, "policy.obs_stride must be at least 1, got 0"),
         ({"obs_stride": 2}, "policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = 5"),
-        ({"n_points": 0}, "policy.n_points must be at least 1 or null (all points), got 0"),
+        ({"n_points": 0}, "policy.n_points must be at least 1 or null, got 0"),
         ({"dtype": "float16"}, "policy.dtype must be float32 or bfloat16, got 'float16'"),
         ({"dim": 33}, "policy.dim must be even and a multiple of n_heads = 2, got 33"),
         (

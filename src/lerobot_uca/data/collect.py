@@ -11,8 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import httpx
-from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineModeIsEnabled
+from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -21,12 +20,14 @@ from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from lerobot.utils.utils import SuppressProgressBars
 from tqdm import tqdm
 
+from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.data.demonstrations import demonstrations
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.hub import uploading
 
 FIRST_SEED = 1_000_000
 """Where the seeds of demonstrations start. LeRobot evaluates from seed 1000 upwards unless told otherwise."""
@@ -54,10 +55,10 @@ class CollectConfig:
     # pickle, or a Minari dataset such as minari:D4RL/door/expert-v2. '{task}' stands for each task.
     expert: str | None = None
     # Successful demonstrations of each task.
-    n_episodes: int = 10
+    n_episodes: int = within(10, least=1, most=1_000_000)
     # Seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of
     # evaluation (LeRobot's start at 1000), or the policy is tested on what it has seen.
-    seed: int = FIRST_SEED
+    seed: int = within(FIRST_SEED, least=0, most=2**31)
     # Replace the folder if it exists.
     overwrite: bool = False
     # Upload the dataset to the Hugging Face Hub under repo_id.
@@ -77,8 +78,7 @@ def collect(config: CollectConfig) -> LeRobotDataset:
     env_config = config.env
     if not isinstance(env_config, PointCloudEnvConfig):
         raise UserError(f"Only point-cloud environments have a demonstrator, got env.type={env_config.type}.")
-    if config.n_episodes < 1:
-        raise UserError(f"n_episodes must be at least 1, got {config.n_episodes}.")
+    check_bounds(config)
     try:
         validate_repo_id(config.repo_id)
     except HFValidationError as error:
@@ -90,11 +90,9 @@ def collect(config: CollectConfig) -> LeRobotDataset:
         _write(config, env_config, attempts, unfinished)
     dataset = LeRobotDataset(config.repo_id, root=root)
     if config.push_to_hub:
-        try:
+        retry = f"LeRobotDataset('{config.repo_id}', root='{root}').push_to_hub() in Python"
+        with uploading(f"The dataset in '{root}'", retry):
             dataset.push_to_hub(private=config.private, tags=["point-cloud", env_config.type])
-        except (HfHubHTTPError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
-            reason = " ".join(str(error).split())
-            raise UserError(f"The dataset in '{root}' is complete but could not be uploaded: {reason}") from error
     return dataset
 
 

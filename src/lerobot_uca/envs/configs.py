@@ -13,6 +13,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_STATE
 
+from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.envs import adroit, metaworld
 from lerobot_uca.envs.experts import adroit_experts
 from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
@@ -27,7 +28,7 @@ class PointCloudEnvConfig(EnvConfig):
     """What all point-cloud environments share: features, task names and vector environments."""
 
     # Points of each cloud.
-    n_points: int = 512
+    n_points: int = within(512, least=1, most=100_000)
 
     def __post_init__(self) -> None:
         with suppress(UserError):  # of wrong tasks; validate() tells it, here draccus would swallow the message
@@ -69,8 +70,7 @@ class PointCloudEnvConfig(EnvConfig):
 
     def validate(self) -> None:
         """Raise a `UserError` for what cannot be made."""
-        if self.n_points < 1:
-            raise UserError(f"env.n_points must be at least 1, got {self.n_points}.")
+        check_bounds(self, "env")
         if self.fps != type(self).fps:  # datasets would tell the wrong time
             raise UserError(f"env.fps of {self.type} is {type(self).fps}, the simulation's own; got {self.fps}.")
         if self.max_parallel_tasks != 1:
@@ -151,7 +151,7 @@ class AdroitPointCloudConfig(PointCloudEnvConfig):
     # One task, several separated by commas, or a group.
     task: str | None = "door"
     # Points of each cloud.
-    n_points: int = 1024
+    n_points: int = within(1024, least=1, most=100_000)
     # The rate of actions, each of which is repeated twice; it cannot be changed.
     fps: int = adroit.FPS
     # What counts as success. final: the goal is reached when the episode's time is over, as in the papers.

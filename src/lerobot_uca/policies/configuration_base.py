@@ -6,6 +6,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
+from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud
 from lerobot_uca.inference.backends import BACKENDS
@@ -32,16 +33,16 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     """
 
     # Observation steps O, the current one included.
-    n_obs_steps: int = 2
+    n_obs_steps: int = within(2, least=1, most=128)
     # Steps from one observation step to the next. An action is predicted for each step, also between them.
-    obs_stride: int = 1
+    obs_stride: int = within(1, least=1, most=128)
     # Predicted actions T, from the first observation step on.
-    horizon: int = 4
+    horizon: int = within(4, least=1, most=1024)
     # Actions executed before the next prediction, from the current step on.
-    n_action_steps: int = 3
+    n_action_steps: int = within(3, least=1, most=1024)
     # How many points of a cloud the policy looks at, sampled farthest point by farthest point; null for all. A cloud
     # in this order already, as those of this package's environments are, keeps its first ones.
-    n_points: int | None = None
+    n_points: int | None = within(None, least=1)
 
     # LeRobot takes the point cloud for a state: it is normalised by channel.
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -49,11 +50,11 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     )
 
     # Widths of the point encoder's layers (the baselines').
-    point_widths: tuple[int, ...] = (64, 128, 256)
+    point_widths: tuple[int, ...] = within((64, 128, 256), least=1, most=8192)
     # Features of a cloud (the baselines').
-    n_point_features: int = 64
+    n_point_features: int = within(64, least=1, most=8192)
     # Features of a robot state (the baselines').
-    n_state_features: int = 64
+    n_state_features: int = within(64, least=1, most=8192)
 
     # What computes actions, the same to rounding: eager (PyTorch, the reference), openvino or onnxruntime (on a CPU;
     # faster for small networks; on other devices it is PyTorch), compile (torch.compile, on a GPU with CUDA graphs).
@@ -65,34 +66,30 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     dtype: str = "float32"
     # The averaged weights follow with decay 1 - (1 + step)^-ema_power, step 0 at the first two updates as in the
     # baselines' code ...
-    ema_power: float = 0.75
+    ema_power: float = within(0.75, least=0, most=10)
     # ... but at most this one.
-    ema_max_decay: float = 0.9999
+    ema_max_decay: float = within(0.9999, least=0, most=1)
     # AdamW's learning rate, after the warm-up and before the cosine.
-    optimizer_lr: float = 1e-4
+    optimizer_lr: float = within(1e-4, above=0, most=10)
     # AdamW's betas.
-    optimizer_betas: tuple[float, float] = (0.95, 0.999)
+    optimizer_betas: tuple[float, float] = within((0.95, 0.999), least=0, below=1)
     # AdamW's epsilon.
-    optimizer_eps: float = 1e-8
+    optimizer_eps: float = within(1e-8, above=0, most=1)
     # AdamW's weight decay.
-    optimizer_weight_decay: float = 1e-6
+    optimizer_weight_decay: float = within(1e-6, least=0, most=10)
     # Gradients are scaled down to this norm; 0 switches it off.
-    optimizer_grad_clip_norm: float = 1.0
+    optimizer_grad_clip_norm: float = within(1.0, least=0)
     # Steps of linear warm-up, followed by a cosine to zero over the remaining steps.
-    scheduler_warmup_steps: int = 500
+    scheduler_warmup_steps: int = within(500, least=0)
 
     def validate_sizes(self) -> None:
-        """Raise a `UserError` for values that do not fit together."""
-        for name in ("n_obs_steps", "obs_stride", "horizon", "n_action_steps"):
-            if getattr(self, name) < 1:
-                raise UserError(f"policy.{name} must be at least 1, got {getattr(self, name)}.")
+        """Raise a `UserError` for values outside their bounds or that do not fit together."""
+        check_bounds(self, "policy")
         if self.horizon < self.executed.stop:
             raise UserError(
                 f"policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = "
                 f"{self.executed.stop}, got {self.horizon}: the actions to execute would not all be predicted."
             )
-        if self.n_points is not None and self.n_points < 1:
-            raise UserError(f"policy.n_points must be at least 1 or null (all points), got {self.n_points}.")
         if self.dtype not in ("float32", "bfloat16"):
             raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
 

@@ -5,6 +5,7 @@ from typing import override
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_uca.bounds import within
 from lerobot_uca.errors import UserError
 from lerobot_uca.inference.backends import BACKENDS
 from lerobot_uca.policies.configuration_unet import UNetPolicyConfig
@@ -17,16 +18,16 @@ class DP3Config(UNetPolicyConfig):
     """Configuration of `DP3Policy`."""
 
     # Diffusion steps of training.
-    n_training_steps: int = 100
+    n_training_steps: int = within(100, least=1, most=10_000)
     # Network calls of a prediction.
-    n_inference_steps: int = 10
+    n_inference_steps: int = within(10, least=1, most=10_000)
 
     @override
     def validate_sizes(self) -> None:
         super().validate_sizes()
-        if not 1 <= self.n_inference_steps <= self.n_training_steps:
+        if self.n_inference_steps > self.n_training_steps:
             raise UserError(
-                f"policy.n_inference_steps must be from 1 to n_training_steps = {self.n_training_steps}, "
+                f"policy.n_inference_steps must be at most n_training_steps = {self.n_training_steps}, "
                 f"got {self.n_inference_steps}."
             )
         if self.inference == "compile":

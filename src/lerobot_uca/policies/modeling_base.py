@@ -30,6 +30,7 @@ from lerobot_uca.policies import (
 )
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.history import Frame, ObservationHistory
+from lerobot_uca.policies.publishing import PublishedPolicy
 
 
 class Model(nn.Module):
@@ -48,7 +49,7 @@ class MethodLoss(NamedTuple):
     parts: dict[str, Tensor]
 
 
-class PointCloudPolicy(PreTrainedPolicy):
+class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
     """A LeRobot policy that makes chunks of actions from point clouds and robot states.
 
     A subclass says which network makes the actions (`make_generator`), how it is trained (`compute_loss`) and how

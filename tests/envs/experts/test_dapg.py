@@ -14,6 +14,7 @@ import torch
 from torch.autograd.variable import Variable
 
 from lerobot_uca.envs.adroit import TASKS, make_simulator
+from lerobot_uca.envs.experts import dapg_pickle
 from lerobot_uca.envs.experts.dapg import DAPGExpert, DAPGWeights
 from lerobot_uca.errors import UserError
 
@@ -232,3 +233,65 @@ def test_arrays_that_are_no_policy(npz, weights, tmp_path):
     np.savez(tmp_path / "object.npz", **{**weights._asdict(), "b1": np.array([{}])})
     with pytest.raises(UserError, match=r"holds no DAPG policy: .*allow_pickle=False"):
         DAPGWeights.read(tmp_path / "object.npz")
+
+
+def text(content: str) -> bytes:
+    return b"X" + len(content).to_bytes(4, "little") + content.encode()
+
+
+def doubling_tuple() -> bytes:
+    """A tuple of itself and itself, 60 times over: its hash takes 2^60 steps."""
+    return b"N\x85" + b"".join(b"q%ch%c\x86" % (level, level) for level in range(60))
+
+
+HOSTILE_PICKLES = {
+    "a key": b"}" + doubling_tuple() + b"Ns.",
+    "keys": b"}(" + doubling_tuple() + b"Nu.",
+    "keys of a dictionary": b"(" + doubling_tuple() + b"Nd.",
+    "values of a set": b"c__builtin__\nset\n](" + doubling_tuple() + b"e\x85R.",
+    "values of a new set": b"\x8f(" + doubling_tuple() + b"\x90.",
+    "values of a frozen set": b"(" + doubling_tuple() + b"\x91.",
+    "keys in order": b"ccollections\nOrderedDict\n](](" + doubling_tuple() + b"Neee\x85R.",
+    "a deep key": b"}N" + b"\x85" * 100_000 + b"Ns.",
+    "a list of itself": b"]q\x00h\x00a.",
+    "a variable of itself": b"cmjrl.policies\nMLP\n)\x81}("
+    + text("trainable_params")
+    + b"]ctorch.autograd.variable\nVariable\n)\x81q\x00}"
+    + text("arguments")
+    + b"h\x00\x85sba"
+    + text("model")
+    + b"Nub.",
+}
+
+
+@pytest.mark.parametrize("content", HOSTILE_PICKLES.values(), ids=HOSTILE_PICKLES)
+@pytest.mark.parametrize("inside", [False, True], ids=["outside", "in PyTorch's bytes"])
+def test_values_that_take_for_ever_are_refused(content, inside, tmp_path):
+    content = b"\x80\x04" + content
+    if inside:
+        encoded = content.decode("latin1")
+        content = b"\x80\x02ctorch.storage\n_load_from_bytes\nc_codecs\nencode\n" + text(encoded)
+        content += text("latin1") + b"\x86R\x85R."
+    (tmp_path / "door.pickle").write_bytes(content)
+    with pytest.raises(UserError, match="holds no DAPG policy"):
+        DAPGWeights.read(tmp_path / "door.pickle")
+
+
+@pytest.mark.parametrize("name", ["door.npz", "door.pickle"])
+def test_a_pipe_is_not_waited_for(name, tmp_path):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(UserError, match="is not a file"):
+        DAPGWeights.read(tmp_path / name)
+
+
+def test_arrays_without_dimensions(tmp_path):
+    np.savez(tmp_path / "door.npz", **dict.fromkeys(DAPGWeights._fields, np.float32(1)))
+    with pytest.raises(UserError, match=r"W0 must have shape \(1, 1\), got \(\)"):
+        DAPGWeights.read(tmp_path / "door.npz")
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path):
+    with (tmp_path / "door.pickle").open("wb") as file:
+        file.truncate(dapg_pickle.MAX_BYTES + 1)
+    with pytest.raises(UserError, match="it has more than"):
+        DAPGWeights.read(tmp_path / "door.pickle")

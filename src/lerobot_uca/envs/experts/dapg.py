@@ -48,6 +48,8 @@ class DAPGWeights(NamedTuple):
             UserError: if the file is not there or holds no such policy.
         """
         try:
+            if path.exists() and not path.is_file():
+                raise UserError(f"'{path}' is not a file.")
             if path.suffix == ".npz":
                 with np.load(path, allow_pickle=False) as file:
                     arrays = [file[name] for name in cls._fields]
@@ -56,6 +58,8 @@ class DAPGWeights(NamedTuple):
             weights = cls(*(np.asarray(array, dtype=np.float32) for array in arrays))
         except OSError as error:
             raise UserError(f"Cannot read the expert's weights: {error}") from error
+        except UserError:
+            raise
         except DAMAGE as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise UserError(f"'{path}' holds no DAPG policy: {reason}") from error
@@ -63,7 +67,7 @@ class DAPGWeights(NamedTuple):
         return weights
 
     def _check(self, path: Path) -> None:
-        n_in, n_first, n_second, n_out = len(self.in_shift), len(self.b0), len(self.b1), len(self.out_shift)
+        n_in, n_first, n_second, n_out = self.in_shift.size, self.b0.size, self.b1.size, self.out_shift.size
         layers = (n_first, n_in), (n_first,), (n_second, n_first), (n_second,), (n_out, n_second), (n_out,)
         shapes = (*layers, (n_in,), (n_in,), (n_out,), (n_out,))
         for name, array, shape in zip(self._fields, self, shapes, strict=True):

@@ -1,0 +1,50 @@
+"""Checkpoints are written whole or not at all, and `last` always names a whole one.
+
+LeRobot writes a checkpoint under its final name, file by file, and removes the link `last` before it makes the new one.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from safetensors import SafetensorError
+
+from lerobot_uca.data.whole_folder import whole_folder
+from lerobot_uca.errors import UserError
+
+
+def save_whole(save: Callable[..., None]) -> Callable[..., None]:
+    """LeRobot's `save_checkpoint`, beside the folder and then moved there."""
+
+    def save_checkpoint(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> None:
+        try:
+            with whole_folder(checkpoint_dir, overwrite=True) as unfinished:
+                save(unfinished, *args, **kwargs)
+        except (UserError, SafetensorError) as error:  # a full disk, for the most part
+            raise UserError(f"The checkpoint could not be written: {error} {_how_to_resume(checkpoint_dir)}") from error
+
+    return save_checkpoint
+
+
+def _how_to_resume(checkpoint_dir: Path) -> str:
+    last = checkpoint_dir.with_name(LAST_CHECKPOINT_LINK)
+    if not last.exists():
+        return "There is none before it."
+    config = last / PRETRAINED_MODEL_DIR / "train_config.json"
+    return (
+        f"The one before, {last.resolve().name}, is whole. When the reason is mended, go on from it: "
+        f"lerobot-train --config_path={config} --resume=true"
+    )
+
+
+def update_last(_: Callable[[Path], Any]) -> Callable[[Path], None]:
+    """LeRobot's `update_last_checkpoint`, in one step."""
+
+    def update_last_checkpoint(checkpoint_dir: Path) -> None:
+        new = checkpoint_dir.with_name(f".{LAST_CHECKPOINT_LINK}.new")
+        new.unlink(missing_ok=True)
+        new.symlink_to(checkpoint_dir.name)
+        new.replace(checkpoint_dir.with_name(LAST_CHECKPOINT_LINK))
+
+    return update_last_checkpoint

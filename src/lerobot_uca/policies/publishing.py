@@ -1,0 +1,184 @@
+"""What a policy's page on the Hugging Face Hub says, and how a policy gets there."""
+
+import time
+from dataclasses import dataclass
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import torch
+from huggingface_hub import ModelCard, ModelCardData
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, OBS_STATE, PRETRAINED_MODEL_DIR
+
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.hub import upload_command, uploading
+from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+
+if TYPE_CHECKING:
+    from lerobot_uca.policies.modeling_base import PointCloudPolicy
+
+PAPERS = {
+    "uca_flow": "*Unified Condition-Action Modeling for Accurate One-Step Action Generation* (UCA-Flow)",
+    "dp3": "[3D Diffusion Policy](https://arxiv.org/abs/2403.03954) (DP3)",
+    "simple_dp3": "[3D Diffusion Policy](https://arxiv.org/abs/2403.03954) (Simple DP3)",
+    "flowpolicy": "[FlowPolicy](https://arxiv.org/abs/2412.04987)",
+    "mp1": "[MP1](https://arxiv.org/abs/2507.10543)",
+}
+N_TIMED = 20
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What the last evaluation of a training has found."""
+
+    pc_success: float
+    n_episodes: int
+    first_seed: int | None
+
+
+class PublishedPolicy:
+    """Uploading of a point-cloud policy; part of `PointCloudPolicy`."""
+
+    config: PointCloudPolicyConfig
+    evaluation: Evaluation | None = None
+    """Set by a training that evaluates."""
+
+    def push_model_to_hub(self, cfg: TrainPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        """Upload weights, settings and card.
+
+        Raises:
+            UserError: if it fails; it says where the policy lies, and how to upload it.
+        """
+        output_dir = cfg.output_dir
+        assert output_dir is not None
+        folder = output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+        with uploading(f"The policy in '{folder}'", upload_command(self.config.repo_id, folder)):
+            super().push_model_to_hub(cfg, *args, **kwargs)  # type: ignore[misc]
+
+    def generate_model_card(  # noqa: PLR0917 (LeRobot's signature)
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,  # noqa: A002 (LeRobot's name)
+        tags: list[str] | None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: Any = None,
+    ) -> ModelCard:
+        """The page of this policy: what it is, was trained on and does, its inputs and outputs, and how to run it."""
+        data = ModelCardData(
+            license=license or "apache-2.0",
+            library_name="lerobot",
+            pipeline_tag="robotics",
+            tags=sorted({*(tags or []), "robotics", "lerobot", "point-cloud", model_type}),
+            model_name=model_type,
+            datasets=dataset_repo_id,
+        )
+        sections = (
+            _what_it_is(self.config),
+            _results(self.evaluation, cfg, latency_ms(self)),  # type: ignore[arg-type]
+            _features(self.config, dataset_meta),
+            _data(dataset_repo_id, dataset_meta),
+            _training(cfg),
+            _commands(self.config, cfg),
+            f"## Licence\n\n{data.license}",
+        )
+        return ModelCard(f"---\n{data.to_yaml()}\n---\n\n" + "\n\n".join(section for section in sections if section))
+
+
+def latency_ms(policy: "PointCloudPolicy") -> float:
+    """Median milliseconds from one normalised observation history to a chunk of actions, here and now."""
+    config = policy.config
+    assert config.input_features is not None
+    device, was_training = next(policy.parameters()).device, policy.training
+    n_points = config.n_points or config.input_features[OBS_POINT_CLOUD].shape[0]
+    observation = {
+        OBS_POINT_CLOUD: torch.zeros(1, n_points, 3, device=device),
+        OBS_STATE: torch.zeros(1, config.n_states, device=device),
+    }
+    policy.eval()
+    policy.reset()
+    times = []
+    with torch.random.fork_rng():
+        for _ in range(N_TIMED):
+            start = time.perf_counter()
+            policy.predict_action_chunk(observation).cpu()
+            times.append(time.perf_counter() - start)
+    policy.reset()
+    policy.train(was_training)
+    return 1e3 * median(times)
+
+
+def _what_it_is(config: PointCloudPolicyConfig) -> str:
+    paper = PAPERS.get(config.type, config.type)
+    return (
+        f"# {config.repo_id or config.type}\n\n"
+        f"A robot policy on 3D point clouds of the type `{config.type}`, the method of {paper}, for "
+        "[LeRobot](https://github.com/huggingface/lerobot) with the plugin `lerobot_policy_uca_flow`. From the last "
+        f"{config.n_obs_steps} point clouds and robot states it makes {config.horizon} actions, of which "
+        f"{config.n_action_steps} are executed before it looks again."
+    )
+
+
+def _results(evaluation: Evaluation | None, cfg: TrainPipelineConfig | None, latency: float) -> str:
+    lines = ["## Results\n"]
+    if evaluation is None:
+        lines.append("- Success: not evaluated during training; see *Commands*.")
+    else:
+        where = f" in `{cfg.env.type}` ({cfg.env.task})" if cfg is not None and cfg.env is not None else ""
+        seeds = "" if evaluation.first_seed is None else f", environment seeds from {evaluation.first_seed}"
+        lines.append(f"- Success: {evaluation.pc_success:.1f} % of {evaluation.n_episodes} episodes{where}{seeds}")
+    lines.append(
+        f"- Latency: {latency:.1f} ms for a chunk of actions, median of {N_TIMED}, on the machine that trained it"
+    )
+    return "\n".join(lines)
+
+
+def _features(config: PointCloudPolicyConfig, dataset_meta: Any) -> str:
+    known = {} if dataset_meta is None else dataset_meta.features
+    rows = ["## Inputs and action\n", "| feature | shape | meaning |", "|---|---|---|"]
+    assert config.input_features is not None
+    for key, feature in {**config.input_features, **config.output_features}.items():
+        if key == OBS_POINT_CLOUD:
+            meaning = "xyz of each point [m], in the frame of the training data"
+        else:
+            names = known.get(key, {}).get("names")
+            listed = ", ".join(map(str, names)) if isinstance(names, list | tuple) else "not named in the data"
+            meaning = f"{listed}; in the units of the training data"
+        rows.append(f"| `{key}` | {tuple(feature.shape)} | {meaning} |")
+    rows += [
+        f"\n{name.capitalize()} of `{key}`: `{feature['info'][name]}`"
+        for key, feature in known.items()
+        for name in ("calibration", "crop")
+        if name in (feature.get("info") or {})
+    ]
+    return "\n".join(rows)
+
+
+def _data(dataset_repo_id: str, dataset_meta: Any) -> str:
+    lines = [f"## Data\n\n- Dataset: `{dataset_repo_id}`"]
+    if dataset_meta is not None:
+        lines.append(
+            f"- {dataset_meta.total_episodes} episodes, {dataset_meta.total_frames} frames at {dataset_meta.fps} Hz"
+        )
+        lines += [f"- Task: {task}" for task in dataset_meta.tasks.index]
+        if dataset_meta.robot_type:
+            lines.append(f"- Robot: {dataset_meta.robot_type}")
+    return "\n".join(lines)
+
+
+def _training(cfg: TrainPipelineConfig | None) -> str:
+    if cfg is None:
+        return ""
+    return f"## Training\n\n{cfg.steps} steps of batches of {cfg.batch_size}, seed {cfg.seed}; `train_config.json`."
+
+
+def _commands(config: PointCloudPolicyConfig, cfg: TrainPipelineConfig | None) -> str:
+    path = config.repo_id or "user/name"
+    env = cfg.env if cfg is not None else None
+    environment = f"--env.type={env.type} --env.task={env.task}" if env is not None else "--env.type=..."
+    return (
+        "## Commands\n\n```bash\npip install lerobot_policy_uca_flow\n"
+        f"lerobot-eval --policy.path={path} {environment} --eval.n_episodes=50\n"
+        f"lerobot-rollout --policy.path={path} --robot.type=...\n"
+        f"lerobot-uca-export {path} --output=policy.onnx\n```"
+    )
