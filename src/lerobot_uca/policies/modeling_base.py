@@ -29,6 +29,7 @@ from lerobot_uca.policies import (
     processor_base,  # noqa: F401 (registers the steps that checkpoints name)
 )
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.distributed import independent_draws
 from lerobot_uca.policies.history import Frame, ObservationHistory
 from lerobot_uca.policies.publishing import PublishedPolicy
 
@@ -119,7 +120,9 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         inputs.check_shape(ACTION, x, (len(observations.state), self.config.horizon, self.config.n_actions))
         mask = self._mask(batch, x)
         model = self.active_model
-        loss = self.compute_loss(model.generator, x, model.encoder(*observations), mask)
+        o = model.encoder(*observations)
+        with independent_draws(x.device):
+            loss = self.compute_loss(model.generator, x, o, mask)
         parts = {name: value.mean().item() for name, value in loss.parts.items()}
         mean = loss.total.mean()
         if not torch.isfinite(mean):
