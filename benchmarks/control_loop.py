@@ -49,7 +49,7 @@ def measure(task: str, sizes: dict[str, Any], n_steps: int) -> dict[str, list[fl
     policy = make_policy(**sizes)
     preprocess, postprocess = make_pre_post_processors(policy.config, dataset_stats=unit_statistics())
     observation, _ = env.reset(seed=0)
-    simulator, camera = env._simulator, env._cloud_camera
+    simulator, camera = env._simulator, env.observer.camera
     cast_alone = camera._caster.cast
     casts: list[float] = []
 

@@ -53,7 +53,7 @@ def measure(config: PointCloudEnvConfig, task: str, expert: Expert, n_steps: int
     for _ in range(n_steps):
         step, _ = timed(env.step, expert(env))
         simulator = env._simulator
-        rays, points = timed(env._cloud_camera.capture, simulator.model, simulator.data, env._markers())
+        rays, points = timed(env.observer.camera.capture, simulator.model, simulator.data, env._markers())
         sample, _ = timed(sample_farthest, points, env.n_points)
         observe, _ = timed(env.observe)
         picture, _ = timed(env.render)

@@ -110,12 +110,12 @@ def load(before: str, after: str) -> subprocess.CompletedProcess[str]:
 
 
 BREAKS = {
-    "a missing wheel": 'import sys; sys.modules["fpsample"] = None',
+    "a missing wheel": 'import sys; sys.modules["mujoco"] = None',
     "any exception": """
 import builtins
 original = builtins.__import__
 def fail(name, *args, **kwargs):
-    if name == "fpsample":
+    if name == "mujoco":
         raise RuntimeError("built for another NumPy")
     return original(name, *args, **kwargs)
 builtins.__import__ = fail
@@ -125,7 +125,7 @@ builtins.__import__ = fail
 
 @pytest.mark.parametrize("before", BREAKS.values(), ids=BREAKS)
 def test_a_broken_part_never_takes_another_one_down(before):
-    """Without Meta-World's or fpsample's wheel the policy must still be there."""
+    """Without Meta-World's or MuJoCo's wheel the policy must still be there."""
     after = """
 from lerobot.policies.factory import get_policy_class
 assert get_policy_class("uca_flow").__name__ == "UCAFlowPolicy"

@@ -19,7 +19,8 @@ from lerobot_uca.data.demonstrations import Demonstration, demonstrate
 from lerobot_uca.envs.adroit import HAND
 from lerobot_uca.envs.configs import AdroitPointCloudConfig, MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO
+from lerobot_uca.point_clouds.recipe import CloudRecipe
 
 
 def config(root, **changes):
@@ -40,7 +41,7 @@ def test_a_dataset_holds_whole_episodes_as_executed(collected):
     attempt = next(env.attempts("drawer-close", None, collecting.FIRST_SEED))
     episode = demonstrate(env.env_factory("drawer-close"), attempt)
     frames = [collected[index] for index in range(200)]
-    np.testing.assert_array_equal(np.stack([frame[OBS_POINT_CLOUD] for frame in frames]), episode.point_cloud)
+    np.testing.assert_array_equal(np.stack([frame[OBS_POINT_CLOUD] for frame in frames]), episode.seen)
     np.testing.assert_array_equal(np.stack([frame["observation.state"] for frame in frames]), episode.state)
     np.testing.assert_array_equal(np.stack([frame["action"] for frame in frames]), episode.action)
     assert np.abs(episode.action).max() == 1  # the expert asks for more; what is written is what was done
@@ -64,6 +65,21 @@ def test_the_dataset_is_the_same_without_progress_bars(collected, tmp_path, monk
     for index in (0, 100, 199):
         for key, value in collected[index].items():
             assert value == other[index][key] if isinstance(value, str) else torch.equal(value, other[index][key])
+
+
+def test_depth_images_make_the_clouds_of_the_same_episode(collected, tmp_path):
+    env = MetaworldPointCloudConfig(task="drawer-close", n_points=16, observation="depth")
+    depth = collect(config(tmp_path / "depth", env=env))
+    (key,) = depth.meta.depth_keys
+    assert key == "observation.images.corner2_depth"
+    for made_with in (depth.features[key]["info"], collected.features[OBS_POINT_CLOUD]["info"]):
+        assert CloudRecipe.from_dict(made_with[RECIPE_INFO]) == env.recipe()
+    make = env.recipe().make()
+    for index in (0, 100):
+        cloud, frame = collected[index][OBS_POINT_CLOUD].numpy(), depth[index]
+        np.testing.assert_array_equal(frame["action"], collected[index]["action"])
+        points = make.points([frame[key].numpy()])
+        assert np.linalg.norm(points[None] - cloud[:, None], axis=-1).min(axis=1).max() < 0.002
 
 
 def test_nothing_but_the_dataset_is_left(collected):

@@ -48,13 +48,13 @@ def test_the_cloud_holds_hand_and_objects_and_not_the_table(env):
     env.reset(seed=0)
     simulator = env._simulator
     model, data = simulator.model, simulator.data
-    points = env._cloud_camera.capture(model, data)
+    points = env.observer.camera.capture(model, data)
     seen = set()
     for point in points:
-        direction = point - np.array(env._cloud_camera.camera.position)
+        direction = point - np.array(env.observer.camera.camera.position)
         geom = np.zeros(1, dtype=np.int32)
         groups = np.array([1, 1, 1, 0, 0, 0], dtype=np.uint8)
-        mujoco.mj_ray(model, data, env._cloud_camera.camera.position, direction, groups, 1, -1, geom)
+        mujoco.mj_ray(model, data, env.observer.camera.camera.position, direction, groups, 1, -1, geom)
         seen.add(model.body(model.geom_bodyid[geom[0]]).name)
     objects = {"hammer": {"Object", "nail"}, "door": {"door", "latch"}, "pen": {"Object", "target"}}
     assert {"palm", "ffproximal", "thproximal"} | objects.get(env.task, {"Object"}) <= seen
@@ -197,7 +197,7 @@ def test_the_expert_succeeds(task, success, adroit_experts):
     env = AdroitPointCloudEnv(task, n_points=16, success=success)
     expert = DAPGExpert(DAPGWeights.read(adroit_experts / f"{task}.npz"))
     env.reset(seed=0)
-    env._cloud_camera.capture = lambda *_: np.zeros((1, 3))  # nothing here looks at clouds
+    env.observer.camera.capture = lambda *_: np.zeros((1, 3))  # nothing here looks at clouds
     steps = [env.step(expert(env))[2:] for _ in range(TASKS[task].episode_length)]
     successes = [info["is_success"] for _, _, info in steps]
     assert [truncated for _, truncated, _ in steps] == [False] * (len(steps) - 1) + [True]

@@ -90,7 +90,7 @@ def test_the_cloud_is_that_of_casting_all_rays_at_everything(task):
             *(geoms, distances, None, len(directions), mujoco.mjMAXVAL),
         )
         points = origin + directions[geoms >= 0] * distances[geoms >= 0, None]
-        np.testing.assert_array_equal(env._cloud_camera.capture(model, data), points[env.crop.contains(points)])
+        np.testing.assert_array_equal(env.observer.camera.capture(model, data), points[env.crop.contains(points)])
 
 
 def test_rendering_needs_no_opengl(env, monkeypatch):

@@ -80,3 +80,64 @@ def test_tasks_in_threads_would_share_the_policys_memory(kind):
     for start in (config.get_env_processors, lambda: make_env(config)):  # of training and of evaluation
         with pytest.raises(UserError, match=r"env\.max_parallel_tasks must be 1, got 2: .* share one policy"):
             start()
+
+
+# Depth --------------------------------------------------------------------------------------------------------------
+
+
+def depth_config(kind: str, task: str):
+    return make_env_config(kind, task=task, observation="depth")
+
+
+@pytest.mark.parametrize(
+    ("kind", "task"),
+    [("metaworld_pointcloud", "drawer-close"), ("metaworld_pointcloud", "hand-insert"), ("adroit_pointcloud", "door")],
+)
+def test_a_depth_image_gives_the_cloud_that_the_environment_gives(kind, task):
+    """Points are where the cloud's are, to half a millimetre of depth; which of them are sampled may differ."""
+    config = depth_config(kind, task)
+    depth_env, cloud_env = config.env_factory(task)(), make_env_config(kind, task=task).env_factory(task)()
+    cloud = cloud_env.reset(seed=3)[0]["point_cloud"]
+    (key,) = set(depth_env.reset(seed=3)[0]) - {"agent_pos"}
+    simulator, markers = cloud_env._simulator, cloud_env._markers()
+    everything = cloud_env.observer.camera.capture(simulator.model, simulator.data, markers)
+    make = config.recipe().make()
+    metres = depth_env.observer.camera.capture(simulator.model, simulator.data, markers)
+    # From exact depth the same cloud; where two points are equally far, as on a door, rounding may take the other one.
+    assert (distances(make([metres / 1e-3]), cloud) < 2e-6).mean() > 0.8
+    # From whole millimetres: each point of a cloud is near one of the other's scene, and no part is left out.
+    image = depth_env.observe()[key]
+    assert (image.shape, image.dtype) == ((1, *metres.shape), np.uint16)
+    from_depth = make([image])
+    bound = 0.0005 * np.linalg.norm(config.view(task)[0].depth_rays(), axis=1).max() + 1e-6
+    spacing = distances(everything, cloud).max()
+    at_edge = distances(from_depth, everything) > bound  # a pixel whose point rounding moved across the crop's face
+    assert at_edge.mean() < 0.01
+    assert distances(from_depth[at_edge], everything).max(initial=0) < 0.01
+    assert distances(everything, from_depth).max() < 1.2 * spacing + 0.001
+
+
+def distances(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+    """From each of the points to the nearest one of the cloud [m]."""
+    return np.array([np.linalg.norm(cloud - point, axis=1).min() for point in points])
+
+
+def test_depth_reaches_the_policy_under_the_names_of_lerobots_cameras():
+    config = depth_config("metaworld_pointcloud", "drawer-close")
+    features = env_to_policy_features(config)
+    assert features["observation.images.corner2_depth"].shape == (1, 128, 128)
+    vector = make_env(config, n_envs=2)["drawer-close"][0]
+    try:
+        batch = preprocess_observation(vector.reset(seed=[5, 6])[0])
+    finally:
+        vector.close()
+    assert batch["observation.images.corner2_depth"].shape == (2, 1, 128, 128)
+
+
+def test_depth_is_of_one_camera_and_one_crop():
+    config = depth_config("metaworld_pointcloud", "drawer-close,hand-insert")
+    with pytest.raises(UserError, match="depth needs tasks of one camera and one crop, got 2 in"):
+        config.validate()
+    with pytest.raises(UserError, match=r"env\.observation must be one of point_cloud, depth, got 'colour'"):
+        make_env_config("metaworld_pointcloud", task="reach", observation="colour").validate()
+    assert make_env_config("metaworld_pointcloud", task="drawer-close,reach").recipe() is not None

@@ -4,6 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.depth_builders import CROP
+from tests.depth_builders import LOOKING_DOWN_AND_AHEAD as ROTATION
+from tests.depth_builders import make_camera as camera
+from tests.depth_builders import random_depth as scene
 
 from lerobot_uca.point_clouds.depth import (
     DepthError,
@@ -14,21 +18,7 @@ from lerobot_uca.point_clouds.depth import (
     to_millimetres,
     unit_of,
 )
-from lerobot_uca.point_clouds.geometry import Camera, Crop, as_pose, sample_farthest
-
-ROTATION = np.array([[0.0, -0.6, 0.8], [-1.0, 0.0, 0.0], [0.0, -0.8, -0.6]])  # looks along +x and down
-CROP = Crop((0.2, -0.3, 0.01), (0.9, 0.35, 0.4))
-
-
-def camera(name="front", *, position=(-0.3, 0.05, 0.7), width=64, height=48, rotation=ROTATION):
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = rotation, position
-    return Camera(name, 0.9 * width, 0.92 * width, 0.48 * width, 0.51 * height, width, height, as_pose(X))
-
-
-def scene(seen_by, seed=0):
-    """Random depths [m] some of which lie inside the crop, (H, W)."""
-    return np.random.default_rng(seed).uniform(0.3, 1.8, (seen_by.height, seen_by.width))
+from lerobot_uca.point_clouds.geometry import Crop, sample_farthest
 
 
 def brute_force(view, depth):
@@ -98,7 +88,10 @@ def test_invalid_depth_never_makes_a_point(far):
 
 def test_several_cameras_are_fused():
     turned = np.diag([-1.0, -1.0, 1.0]) @ ROTATION
-    views = [DepthView(camera("front")), DepthView(camera("back", position=(1.4, 0.0, 0.6), rotation=turned, width=80))]
+    views = [
+        DepthView(camera("front")),
+        DepthView(camera("back", position=(1.4, 0.0, 0.6), rotation=turned, size=(80, 48))),
+    ]
     make = DepthToCloud(views, CROP, 128)
     depths = [scene(view.camera, seed).astype(np.float32) for seed, view in enumerate(views)]
     each = [DepthToCloud([view], CROP, 128).points([depth]) for view, depth in zip(views, depths, strict=True)]
@@ -109,7 +102,7 @@ def test_several_cameras_are_fused():
 
 
 def test_many_pixels_are_thinned_out_evenly_first():
-    view = DepthView(camera(width=320, height=240))
+    view = DepthView(camera(size=(320, 240)))
     make = DepthToCloud([view], CROP, 128)
     floor = view.camera.depth_rays()[:, 2]
     depth = np.where(floor < 0, (0.05 - view.camera.position[2]) / np.minimum(floor, -1e-9), 0).reshape(240, 320)

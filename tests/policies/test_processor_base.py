@@ -29,6 +29,7 @@ def test_the_steps_and_their_names():
     names = [step._registry_name for step in preprocessor().steps]
     assert names == [
         "rename_observations_processor",
+        "depth_to_cloud_processor",
         "point_cloud_processor",
         "to_batch_processor",
         "device_processor",
@@ -42,7 +43,7 @@ def test_the_step_is_saved_and_loaded(tmp_path):
     pre.save_pretrained(tmp_path)
     post.save_pretrained(tmp_path)
     loaded, _ = make_pre_post_processors(config, pretrained_path=str(tmp_path))
-    assert loaded.steps[1] == PointCloudProcessorStep(n_points=10)
+    assert loaded.steps[2] == PointCloudProcessorStep(n_points=10)
     batch = {OBS_POINT_CLOUD: torch.rand(2, N_POINTS, 3), STATE: torch.rand(2, N_STATES)}
     torch.testing.assert_close(loaded(batch)[OBS_POINT_CLOUD], pre(batch)[OBS_POINT_CLOUD], rtol=0, atol=0)
 

@@ -11,13 +11,15 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from huggingface_hub.errors import HFValidationError
 from huggingface_hub.utils import validate_repo_id
-from lerobot.configs import parser
+from lerobot.configs import FeatureType, parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
 from lerobot.utils.utils import SuppressProgressBars
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_uca.bounds import check_bounds, within
@@ -26,7 +28,7 @@ from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO
 from lerobot_uca.hub import uploading
 
 FIRST_SEED = 1_000_000
@@ -126,10 +128,9 @@ def _collect_task(
     with closing(episodes), bar as progress:
         for n_tried, episode in enumerate(episodes, start=1):
             if episode.is_successful:
-                for point_cloud, state, action in zip(*episode[:3], strict=True):
-                    dataset.add_frame(
-                        {OBS_POINT_CLOUD: point_cloud, OBS_STATE: state, ACTION: action, "task": description}
-                    )
+                for seen, state, action in zip(*episode[:3], strict=True):
+                    frame = {OBS_STATE: state, ACTION: action, "task": description}
+                    dataset.add_frame({**frame, **_seen(env_config, seen)})
                 with SuppressProgressBars():
                     dataset.save_episode()
                 n_kept += 1
@@ -141,13 +142,36 @@ def _collect_task(
             )
 
 
+def _seen(env_config: PointCloudEnvConfig, seen: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """A cloud (N, 3) or a depth image (1, H, W) under its feature's name; LeRobot writes images as (H, W, 1)."""
+    (key,) = set(env_config.features_map.values()) - {OBS_STATE, ACTION}
+    return {key: seen if key == OBS_POINT_CLOUD else np.moveaxis(seen, 0, -1)}
+
+
 def _features(env_config: PointCloudEnvConfig) -> dict[str, dict[str, Any]]:
     state_names, action_names = env_config.state_names(), env_config.action_names()
-    return {
-        OBS_POINT_CLOUD: {"dtype": "float32", "shape": (env_config.n_points, 3), "names": ["point", "xyz"]},
+    features: dict[str, dict[str, Any]] = {
         OBS_STATE: {"dtype": "float32", "shape": (len(state_names),), "names": state_names},
         ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": action_names},
     }
+    recipe = env_config.recipe()
+    info = {} if recipe is None else {RECIPE_INFO: recipe.as_dict()}
+    for name, feature in env_config.features.items():
+        if feature.type is FeatureType.VISUAL:
+            features[env_config.features_map[name]] = {
+                "dtype": "image",
+                "shape": feature.shape,
+                "names": ["height", "width", "channels"],
+                "info": {"is_depth_map": True, **info},
+            }
+        elif name == "point_cloud":
+            features[OBS_POINT_CLOUD] = {
+                "dtype": "float32",
+                "shape": feature.shape,
+                "names": ["point", "xyz"],
+                "info": info,
+            }
+    return features
 
 
 @parser.wrap()

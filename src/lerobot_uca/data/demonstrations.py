@@ -21,7 +21,7 @@ from lerobot_uca.processes import end_with_parent
 class Demonstration(NamedTuple):
     """One episode: what was seen before each of L steps, what was done, and whether it is worth keeping."""
 
-    point_cloud: NDArray[np.float32]  # (L, N, 3)
+    seen: NDArray[Any]  # (L, N, 3) point clouds or (L, 1, H, W) depth images
     state: NDArray[np.float32]  # (L, S)
     action: NDArray[np.float32]  # (L, A), as executed
     is_successful: bool
@@ -36,13 +36,13 @@ def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> D
     is_over = False
     while not is_over:
         action = expert(env)
-        steps.append((observation["point_cloud"], observation["agent_pos"], action))
+        steps.append((observation[env.observer.key], observation["agent_pos"], action))
         observation, _, terminated, truncated, info = env.step(action)
         n_successful += info["is_success"]
         is_over = truncated or (terminated and not info["is_success"])
     env.close()
-    point_cloud, state, actions = (np.stack(column) for column in zip(*steps, strict=True))
-    return Demonstration(point_cloud, state, actions, n_successful >= env.min_successful_steps)
+    seen, state, actions = (np.stack(column) for column in zip(*steps, strict=True))
+    return Demonstration(seen, state, actions, n_successful >= env.min_successful_steps)
 
 
 def demonstrations(

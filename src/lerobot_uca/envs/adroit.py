@@ -182,7 +182,12 @@ class AdroitPointCloudEnv(PointCloudEnv):
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium's own declaration)
 
     def __init__(
-        self, task: str, n_points: int = 1024, success: str = "final", joints: Sequence[str] | None = None
+        self,
+        task: str,
+        n_points: int = 1024,
+        success: str = "final",
+        joints: Sequence[str] | None = None,
+        observation: str = "point_cloud",
     ) -> None:
         task = only_task(task, resolve(task))
         self._task = TASKS[task]
@@ -191,6 +196,7 @@ class AdroitPointCloudEnv(PointCloudEnv):
             task,
             self._task.description,
             n_points=n_points,
+            observation=observation,
             n_states=len(HAND),
             n_actions=len(joints),
             camera=self._task.camera,

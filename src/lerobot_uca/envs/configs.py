@@ -11,15 +11,19 @@ import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.envs import adroit, metaworld
 from lerobot_uca.envs.experts import adroit_experts
 from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
+from lerobot_uca.envs.observers import OBSERVERS, depth_name
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.calibration import Calibration
+from lerobot_uca.point_clouds.geometry import Camera, Crop
+from lerobot_uca.point_clouds.recipe import SIMULATED, CloudRecipe, DepthSource
 from lerobot_uca.registry import register
 
 
@@ -29,15 +33,24 @@ class PointCloudEnvConfig(EnvConfig):
 
     # Points of each cloud.
     n_points: int = within(512, least=1, most=100_000)
+    # What is observed besides the robot's state: point_cloud, or depth, the image that such a cloud is made from.
+    observation: str = "point_cloud"
 
     def __post_init__(self) -> None:
         with suppress(UserError):  # of wrong tasks; validate() tells it, here draccus would swallow the message
             self.features = {
                 ACTION: PolicyFeature(FeatureType.ACTION, (len(self.action_names()),)),
-                "point_cloud": PolicyFeature(FeatureType.STATE, (self.n_points, 3)),
                 "agent_pos": PolicyFeature(FeatureType.STATE, (len(self.state_names()),)),
             }
-        self.features_map = {ACTION: ACTION, "point_cloud": OBS_POINT_CLOUD, "agent_pos": OBS_STATE}
+            self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE}
+            if self.observation == "depth":
+                for camera, _ in self._views():
+                    name = depth_name(camera)
+                    self.features[name] = PolicyFeature(FeatureType.VISUAL, (camera.height, camera.width, 1))
+                    self.features_map[name] = f"{OBS_STR}.{name}"
+            else:
+                self.features["point_cloud"] = PolicyFeature(FeatureType.STATE, (self.n_points, 3))
+                self.features_map["point_cloud"] = OBS_POINT_CLOUD
 
     @abstractmethod
     def tasks(self) -> dict[str, tuple[str, ...]]:
@@ -50,6 +63,23 @@ class PointCloudEnvConfig(EnvConfig):
     @abstractmethod
     def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
         """Tries at demonstrations of one task, by the expert that a user has named, from a seed upwards."""
+
+    @abstractmethod
+    def view(self, task: str) -> tuple[Camera, Crop]:
+        """What a task is seen with, and what belongs to its cloud."""
+
+    def _views(self) -> list[tuple[Camera, Crop]]:
+        """The different views of all tasks."""
+        return list(dict.fromkeys(self.view(task) for tasks in self.tasks().values() for task in tasks))
+
+    def recipe(self) -> CloudRecipe | None:
+        """How clouds are made from depth images; None if the tasks differ in camera or crop."""
+        views = self._views()
+        if len(views) != 1:
+            return None
+        ((camera, crop),) = views
+        calibration = Calibration(camera, serial=SIMULATED, method=SIMULATED)
+        return CloudRecipe((DepthSource(f"{OBS_STR}.{depth_name(camera)}", calibration),), crop, self.n_points)
 
     @abstractmethod
     def task_description(self, task: str) -> str:
@@ -78,7 +108,14 @@ class PointCloudEnvConfig(EnvConfig):
                 f"env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: LeRobot's parallel tasks are "
                 "threads that share one policy, which remembers one episode. eval.batch_size runs episodes at once."
             )
+        if self.observation not in OBSERVERS:
+            raise UserError(f"env.observation must be one of {', '.join(OBSERVERS)}, got '{self.observation}'.")
         self.tasks()
+        if self.observation == "depth" and self.recipe() is None:
+            raise UserError(
+                f"env.observation=depth needs tasks of one camera and one crop, got {len(self._views())} in "
+                f"'{self.task}'."
+            )
 
     @override
     def get_env_processors(self) -> tuple[Any, Any]:
@@ -122,7 +159,11 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
 
     @override
     def env_factory(self, task: str) -> Callable[[], PointCloudEnv]:
-        return partial(metaworld.MetaworldPointCloudEnv, task, n_points=self.n_points)
+        return partial(metaworld.MetaworldPointCloudEnv, task, n_points=self.n_points, observation=self.observation)
+
+    @override
+    def view(self, task: str) -> tuple[Camera, Crop]:
+        return metaworld.CLOUD_CAMERA, metaworld.crop_of(task)
 
     @override
     def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
@@ -175,7 +216,12 @@ class AdroitPointCloudConfig(PointCloudEnvConfig):
             n_points=self.n_points,
             success=self.success,
             joints=self.action_names(),
+            observation=self.observation,
         )
+
+    @override
+    def view(self, task: str) -> tuple[Camera, Crop]:
+        return adroit.TASKS[task].camera, adroit.TASKS[task].crop
 
     @override
     def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:

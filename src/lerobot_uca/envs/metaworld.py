@@ -39,6 +39,12 @@ CROP = Crop(low=(-0.5, 0.28, 0.005), high=(0.55, 0.97, 0.5))
 HOLE_CROP = Crop(low=(-0.25, 0.45, -0.1), high=(0.25, 0.97, 0.5))
 HOLE_TASKS = ("hand-insert", "pick-out-of-hole", "sweep-into")
 
+
+def crop_of(task: str) -> Crop:
+    """What belongs to a task's cloud."""
+    return HOLE_CROP if task in HOLE_TASKS else CROP
+
+
 EPISODE_LENGTH = 200
 FPS = 80  # 5 simulation steps of 2.5 ms
 
@@ -95,6 +101,7 @@ class MetaworldPointCloudEnv(PointCloudEnv):
     Args:
         task: a name from `task_descriptions()`, with or without '-v3'.
         n_points: points of the cloud.
+        observation: point_cloud or depth.
     """
 
     benchmark = "Meta-World"
@@ -102,7 +109,7 @@ class MetaworldPointCloudEnv(PointCloudEnv):
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium's own declaration)
     _max_episode_steps = EPISODE_LENGTH  # LeRobot reads it
 
-    def __init__(self, task: str, n_points: int = 512) -> None:
+    def __init__(self, task: str, n_points: int = 512, observation: str = "point_cloud") -> None:
         task = only_task(task, resolve(task))
         super().__init__(
             task,
@@ -110,8 +117,9 @@ class MetaworldPointCloudEnv(PointCloudEnv):
             n_points=n_points,
             n_states=9,
             n_actions=4,
+            observation=observation,
             camera=CLOUD_CAMERA,
-            crop=HOLE_CROP if task in HOLE_TASKS else CROP,
+            crop=crop_of(task),
             picture_camera=PICTURE_CAMERA,
         )
 

@@ -8,21 +8,22 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_uca.envs.observers import OBSERVERS, Observer
 from lerobot_uca.errors import UserError
-from lerobot_uca.point_clouds.cameras import Marker, PictureCamera, PointCloudCamera
-from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, sample_farthest
+from lerobot_uca.point_clouds.cameras import Marker, PictureCamera
+from lerobot_uca.point_clouds.geometry import Array, Camera, Crop
 
 PICTURE_ZOOM = 2  # each ray becomes 2 x 2 pixels: 320 x 320 is large enough to look at, and four times cheaper
 
-Observation = dict[str, NDArray[np.float32]]
+Observation = dict[str, NDArray[Any]]
 
 
 class PointCloudEnv(gym.Env[Any, Any]):
-    """One task of a MuJoCo benchmark, observed as a point cloud and the robot's own state.
+    """One task of a MuJoCo benchmark, observed as a point cloud, or a depth image, and the robot's own state.
 
     Observation:
-        point_cloud: (n_points, 3) float32, world frame [m], farthest point sampling of what the camera sees inside
-            the crop, in sampling order.
+        point_cloud: (n_points, 3) float32, world frame [m], or
+        images.<camera>_depth: (1, height, width) uint16 [mm]; see `CloudObserver` and `DepthObserver`.
         agent_pos: (n_states,) float32, the robot's own state, in the benchmark's units.
     Action: (n_actions,) float32 in [-1, 1]; what lies outside is clipped.
     The simulator is created at the first reset, so that vector environments build it in their workers.
@@ -31,7 +32,8 @@ class PointCloudEnv(gym.Env[Any, Any]):
         task: its name.
         description: what it asks for, in English.
         n_points, n_states, n_actions: lengths of cloud, agent_pos and action.
-        camera: what the cloud is seen with.
+        observation: what is observed besides agent_pos, a key of `OBSERVERS`.
+        camera: what the scene is observed with.
         crop: what belongs to the cloud.
         picture_camera: what people see the task with.
     """
@@ -49,15 +51,17 @@ class PointCloudEnv(gym.Env[Any, Any]):
         n_points: int,
         n_states: int,
         n_actions: int,
+        observation: str,
         camera: Camera,
         crop: Crop,
         picture_camera: Camera,
     ) -> None:
         self.task, self.task_description = task, description
         self.n_points, self.crop = n_points, crop
+        self.observer: Observer = OBSERVERS[observation](camera, crop, n_points)
         self.observation_space = gym.spaces.Dict(
             {
-                "point_cloud": gym.spaces.Box(-np.inf, np.inf, (n_points, 3), np.float32),
+                self.observer.key: self.observer.space,
                 "agent_pos": gym.spaces.Box(-np.inf, np.inf, (n_states,), np.float32),
             }
         )
@@ -66,7 +70,6 @@ class PointCloudEnv(gym.Env[Any, Any]):
         self.expert_observation: Any = None
         """The simulator's own observation after the last reset or step, goal included: for experts."""
         self._simulator: Any = None
-        self._cloud_camera = PointCloudCamera(camera, crop)
         self._picture_camera = picture_camera
         self._picture: PictureCamera | None = None
         self._n_steps = 0
@@ -85,18 +88,12 @@ class PointCloudEnv(gym.Env[Any, Any]):
 
     def observe(self) -> Observation:
         """The present state. Asking twice gives the same twice."""
-        simulator, camera = self._running_simulator(), self._cloud_camera.camera
-        points = self._cloud_camera.capture(simulator.model, simulator.data, self._markers())
-        if len(points) == 0:
-            position = tuple(camera.position.tolist())
-            raise UserError(
-                f"{self.benchmark} {self.task}: the cloud is empty. Camera {camera.name} at {position} m "
-                f"sees no point inside the crop {self.crop.low} to {self.crop.high} m."
-            )
-        return {
-            "point_cloud": sample_farthest(points, self.n_points),
-            "agent_pos": self._agent_pos().astype(np.float32),
-        }
+        simulator = self._running_simulator()
+        try:
+            seen = self.observer(simulator.model, simulator.data, self._markers())
+        except UserError as error:
+            raise UserError(f"{self.benchmark} {self.task}: {error}") from error
+        return {self.observer.key: seen, "agent_pos": self._agent_pos().astype(np.float32)}
 
     def render(self) -> NDArray[np.uint8]:
         """The scene as a shaded ray-cast picture, (320, 320, 3) uint8."""

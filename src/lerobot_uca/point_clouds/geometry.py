@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-import fpsample
 import numpy as np
 from numpy.typing import NDArray
 
@@ -168,6 +167,8 @@ def subsample_farthest(points: NDArray[np.float32], n_points: int) -> NDArray[np
     """
     if len(points) > MAX_PLAIN_POINTS:
         return sample_farthest(points, n_points)
+    import fpsample  # where a cloud is sampled: policies must register without it
+
     return points[fpsample.fps_sampling(points, n_points, start_idx=0)]
 
 
@@ -183,6 +184,8 @@ def sample_farthest(points: NDArray[np.floating[Any]], n_points: int) -> NDArray
     """
     if len(points) == 0:
         raise ValueError("The point cloud is empty: 0 points, at least 1 is needed.")
+    import fpsample  # as above
+
     cloud = np.ascontiguousarray(points, dtype=np.float32)
     n_distinct = min(n_points, len(cloud))
     if len(cloud) < 2**KD_TREE_HEIGHT:  # too few to fill the tree

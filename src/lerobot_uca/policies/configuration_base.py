@@ -1,6 +1,7 @@
 """What all point-cloud policies of this package have in common: observations, horizons, encoder, training recipe."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
@@ -10,6 +11,7 @@ from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud
 from lerobot_uca.inference.backends import BACKENDS
+from lerobot_uca.policies.depth_config import DepthConfig
 from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
 
@@ -43,6 +45,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # How many points of a cloud the policy looks at, sampled farthest point by farthest point; null for all. A cloud
     # in this order already, as those of this package's environments are, keeps its first ones.
     n_points: int | None = within(None, least=1)
+
+    # Training from depth images, which become clouds.
+    depth: DepthConfig = field(default_factory=DepthConfig)
 
     # LeRobot takes the point cloud for a state: it is normalised by channel.
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -126,6 +131,24 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (cloud.shape[0], 3)),
             OBS_STATE: PolicyFeature(FeatureType.STATE, tuple(state.shape)),
         }
+
+    def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
+        """Take note of how a dataset's clouds are made; of depth images, make them. LeRobot calls it before training.
+
+        Raises:
+            UserError: if depth images lack a calibration or a crop, or do not fit the checkpoint to be trained further.
+        """
+        knows_clouds = self.depth.recipe is not None
+        recipe = self.depth.settle(features)
+        if recipe is None or find_point_cloud(features) is not None:
+            return
+        if self.pretrained_path and not knows_clouds:
+            raise UserError(
+                f"'{self.pretrained_path}' was trained on clouds of unknown origin: the dataset needs "
+                f"'{OBS_POINT_CLOUD}', got depth images. lerobot-uca-convert makes clouds from them."
+            )
+        inputs = {key: feature for key, feature in (self.input_features or {}).items() if key not in recipe.keys}
+        self.input_features = {**inputs, OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (recipe.n_points, 3))}
 
     @property
     def n_states(self) -> int:

@@ -65,7 +65,7 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
     config: PointCloudPolicyConfig
     ema_step: Tensor
 
-    def __init__(self, config: PointCloudPolicyConfig, **_: Any) -> None:
+    def __init__(self, config: PointCloudPolicyConfig, dataset_meta: Any = None, **_: Any) -> None:
         # `make_policy` passes the dataset's statistics and metadata as well; normalisation is the processors' task.
         if not isinstance(config, self.config_class):
             raise UserError(
@@ -74,6 +74,8 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
             )
         super().__init__(config)
         config.validate_features()
+        if dataset_meta is not None and dataset_meta.stats:
+            config.depth.add_statistics(dataset_meta.stats)
         encoder = ObservationEncoder(
             config.n_states, config.point_widths, config.n_point_features, config.n_state_features
         )

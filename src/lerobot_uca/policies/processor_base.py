@@ -18,6 +18,7 @@ from torch import Tensor
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, VALID_MASK_SUFFIX, find_point_cloud
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
 
 logger = logging.getLogger(__name__)
 
@@ -29,11 +30,15 @@ Processors = tuple[
 def make_processors(
     config: PointCloudPolicyConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
 ) -> Processors:
-    """LeRobot's pipelines (rename, batch, device, normalise; and back), with a uniform point cloud before the batch."""
+    """LeRobot's pipelines (rename, batch, device, normalise; and back), with a uniform point cloud before the batch.
+
+    Where there are depth images, the cloud is made from them.
+    """
     steps = make_default_policy_processor_steps(config, dataset_stats)
     return make_policy_processor_pipelines(
         [
             steps.rename_observations,
+            DepthToCloudProcessorStep(recipe=config.depth.recipe),
             PointCloudProcessorStep(n_points=config.n_points),
             steps.add_batch_dim,
             steps.to_device,

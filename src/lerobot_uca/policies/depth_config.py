@@ -1,0 +1,137 @@
+"""How a policy's cloud is made from a dataset's depth images, if it is: options, and what becomes of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO, find_point_cloud
+from lerobot_uca.point_clouds.calibration import CalibrationError
+from lerobot_uca.point_clouds.recipe import (
+    CloudRecipe,
+    calibration_of,
+    camera_of,
+    depth_source,
+    installed_calibrations,
+    make_crop,
+)
+
+Features = Mapping[str, Mapping[str, Any]]
+
+
+@dataclass
+class DepthConfig:
+    """Training from depth images, and running on a robot that has them. Metres, in the robot's base frame."""
+
+    # Lowest corner of the crop: what lies outside is no part of the cloud. lerobot-uca-view helps to choose it.
+    crop_low: tuple[float, float, float] | None = None
+    # Highest corner of the crop.
+    crop_high: tuple[float, float, float] | None = None
+    # Points of the cloud. policy.n_points may look at fewer of them.
+    n_points: int = 512
+    # Folder of the cameras' calibrations, for training; by default $LEROBOT_UCA_CALIBRATION, which also holds on the
+    # robot.
+    calibration: str | None = None
+    # How clouds were made in training; written by training, not for users.
+    recipe: dict[str, Any] | None = None
+
+    def settle(self, features: Features) -> CloudRecipe | None:
+        """The recipe for a dataset's features, which the configuration keeps; None if it has clouds of unknown origin.
+
+        Raises:
+            UserError: if depth images need a calibration or a crop that is not there, or if another recipe is kept.
+        """
+        try:
+            recipe = self._recipe_for(features)
+        except CalibrationError as error:
+            raise UserError(str(error)) from error
+        self.calibration = None  # a path of this machine; the recipe holds what was in it
+        if recipe is not None:
+            self.recipe = recipe.as_dict()
+        return recipe
+
+    def add_statistics(self, stats: dict[str, dict[str, Any]]) -> None:
+        """Give a dataset of depth images the statistics of the clouds made from them: the crop's corners.
+
+        LeRobot hands the same dictionary to the normaliser, which passes what has no statistics as it is. So does a
+        training that starts from a checkpoint: there, too, they have to be in the dataset's.
+        """
+        if self.recipe is not None and find_point_cloud(stats) is None:
+            low, high = self.recipe["crop"]
+            stats[OBS_POINT_CLOUD] = {"min": np.array(low, np.float32), "max": np.array(high, np.float32)}
+
+    def _recipe_for(self, features: Features) -> CloudRecipe | None:
+        kept = CloudRecipe.from_dict(self.recipe) if self.recipe is not None else None
+        cloud_key = find_point_cloud(features)
+        if cloud_key is not None:
+            made_with = (features[cloud_key].get("info") or {}).get(RECIPE_INFO)
+            return kept or (CloudRecipe.from_dict(made_with) if made_with else None)
+        keys = depth_keys(features)
+        if not keys:
+            return kept
+        recipe = recipe_for(features, self._crop(kept), kept.n_points if kept else self.n_points, self.calibration)
+        if kept is not None:
+            _check_same(kept, recipe)
+        return recipe
+
+    def _crop(self, kept: CloudRecipe | None) -> tuple[Any, Any] | None:
+        if kept is not None:
+            return kept.crop.low, kept.crop.high
+        if self.crop_low is None or self.crop_high is None:
+            return None
+        return self.crop_low, self.crop_high
+
+
+def depth_keys(features: Features) -> list[str]:
+    """The features of a dataset that are depth images."""
+    return [
+        key
+        for key, feature in features.items()
+        if feature["dtype"] in ("image", "video") and (feature.get("info") or {}).get("is_depth_map")
+    ]
+
+
+def recipe_for(features: Features, crop: tuple[Any, Any] | None, n_points: int, folder: str | None) -> CloudRecipe:
+    """The recipe for all depth images of a dataset.
+
+    Calibrations are those of a folder or of $LEROBOT_UCA_CALIBRATION. A simulated camera comes with a recipe, in which
+    its calibration and a crop are.
+
+    Raises:
+        CalibrationError: if a calibration or the crop is missing.
+    """
+    installed = installed_calibrations(folder)
+    sources = []
+    for key in depth_keys(features):
+        info = features[key].get("info") or {}
+        if RECIPE_INFO in info:
+            own = CloudRecipe.from_dict(info[RECIPE_INFO])
+            crop = crop or (own.crop.low, own.crop.high)
+            known = {camera_of(source.key): source.calibration for source in own.sources}
+            calibration = calibration_of(camera_of(key), known)
+        else:
+            calibration = calibration_of(camera_of(key), installed)
+        sources.append(depth_source(key, info, calibration))
+    if crop is None:
+        raise CalibrationError(
+            "A cloud from depth needs a crop: give crop_low and crop_high, two corners [m] in the robot's base frame."
+        )
+    return CloudRecipe(tuple(sources), make_crop(*crop), n_points)
+
+
+def _check_same(kept: CloudRecipe, recipe: CloudRecipe) -> None:
+    """A checkpoint goes on making clouds as in its training, so its new data must be of the same installation."""
+    if kept.keys != recipe.keys:
+        raise CalibrationError(
+            f"The checkpoint makes its cloud from {', '.join(kept.keys)}, the dataset has {', '.join(recipe.keys)}."
+        )
+    installed = installed_calibrations()
+    uses = kept.with_calibrations(installed) if installed is not None else kept
+    differences = uses.differences(recipe)
+    if differences:
+        raise CalibrationError(
+            f"The checkpoint would make clouds as in its own installation, but in the dataset's {differences[0]}. Let "
+            "LEROBOT_UCA_CALIBRATION name the dataset's calibrations, or convert it with lerobot-uca-convert first."
+        )

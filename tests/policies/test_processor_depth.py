@@ -1,0 +1,343 @@
+"""Policies that see depth images: the same clouds in training, resumed, trained further, and on the robot."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
+from lerobot.policies.utils import prepare_observation_for_inference
+from lerobot.scripts import lerobot_train
+from tests.builders import N_STATES, SMALL_POLICIES
+from tests.depth_builders import (
+    CROP,
+    DEPTH_KEY,
+    N_CLOUD_POINTS,
+    live_frame,
+    make_calibration,
+    make_camera,
+    make_recipe,
+    write_depth_dataset,
+)
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.depth import DepthToCloud
+from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, CloudRecipe, camera_of
+from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from lerobot_uca.policies.depth_config import DepthConfig
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
+
+LOG_STEP = (np.log(13.5) - np.log(3.51)) / 4095
+"""Of LeRobot's depth codes: log(depth + 3.5 m) of 0.01 to 10 m in 12 bits."""
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["tiff", "video"])
+def recorded(request, tmp_path_factory):
+    return write_depth_dataset(tmp_path_factory.mktemp("depth") / "data", video=request.param)
+
+
+@pytest.fixture
+def calibrated(tmp_path, monkeypatch):
+    folder = tmp_path / "calibration"
+    make_calibration().write(folder)
+    monkeypatch.setenv(CALIBRATION_VARIABLE, str(folder))
+    return folder
+
+
+def policy_config(**changes):
+    depth = DepthConfig(crop_low=CROP.low, crop_high=CROP.high, n_points=N_CLOUD_POINTS)
+    settings = {"device": "cpu", "push_to_hub": False, "depth": depth, **SMALL_POLICIES["uca_flow"], **changes}
+    return UCAFlowConfig(**settings)
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """What the policy sees in training: normalised clouds (B, O, N, 3), and the index of their newest frame."""
+    batches = []
+    forward = UCAFlowPolicy.forward
+
+    def remember(self, batch, *arguments, **options):
+        batches.append((batch[OBS_POINT_CLOUD].clone(), batch["index"].clone()))
+        return forward(self, batch, *arguments, **options)
+
+    monkeypatch.setattr(UCAFlowPolicy, "forward", remember)
+    return batches
+
+
+def train(dataset, output, policy, steps=1, **changes):
+    config = TrainPipelineConfig(
+        dataset=DatasetConfig(repo_id="test/depth", root=str(dataset.root)),
+        policy=policy,
+        output_dir=output,
+        batch_size=4,
+        steps=steps,
+        num_workers=0,
+        save_freq=1,
+        **changes,
+    )
+    lerobot_train.train(config)
+    return output / "checkpoints" / f"{steps:06d}" / "pretrained_model"
+
+
+def normalised(cloud):
+    low, high = np.float32(CROP.low), np.float32(CROP.high)
+    return 2 * (cloud - low) / (high - low) - 1
+
+
+def live_cloud(index):
+    """The cloud of a live frame, by the pure function."""
+    return normalised(make_recipe().make()([live_frame(index)]))
+
+
+def as_rollout_gives(index):
+    """A robot's observation as lerobot-rollout hands it to the preprocessor: torch uint16 (1, 1, H, W)."""
+    observation = {DEPTH_KEY: live_frame(index), "observation.state": np.zeros(N_STATES, np.float32)}
+    return prepare_observation_for_inference(observation, torch.device("cpu"))
+
+
+def check_clouds(dataset, batches):
+    """Clouds of a training are those of the live frames: bit for bit from TIFF, within the codes' step from video."""
+    is_video = DEPTH_KEY in dataset.meta.video_keys
+    assert batches
+    for clouds, indices in batches:
+        for cloud, index in zip(clouds[:, -1].numpy(), indices.tolist(), strict=True):
+            if is_video:
+                assert gap(cloud, every_live_point(index)) <= VIDEO_BOUND
+            else:
+                np.testing.assert_array_equal(cloud, live_cloud(index))
+
+
+VIDEO_BOUND = (0.5 * LOG_STEP * (1.8 + 3.5) + 0.001) * 1.5
+"""[m] Half a code's step at the farthest depth here and twice a rounding to millimetres, along a ray of 1.5 m a metre.
+A cloud's points are real ones this far off; which of them are sampled may differ."""
+
+
+def every_live_point(index):
+    make = make_recipe().make()
+    views = make.views
+    wide = type(CROP)(tuple(v - 0.01 for v in CROP.low), tuple(v + 0.01 for v in CROP.high))
+    return DepthToCloud(views, wide, N_CLOUD_POINTS).points([live_frame(index)])
+
+
+def gap(cloud, points):
+    """How far a point of a normalised cloud is from all points [m]."""
+    low, high = np.float32(CROP.low), np.float32(CROP.high)
+    metres = (cloud + 1) / 2 * (high - low) + low
+    return np.linalg.norm(metres[:, None] - points[None], axis=-1).min(axis=1).max()
+
+
+def test_training_resuming_training_further_and_the_robot_see_the_same_clouds(
+    recorded, calibrated, seen, tmp_path, monkeypatch
+):
+    fresh = train(recorded, tmp_path / "fresh", policy_config(), steps=1)
+    check_clouds(recorded, seen)
+    config = policy_config().from_pretrained(fresh)
+    assert config.input_features[OBS_POINT_CLOUD].shape == (N_CLOUD_POINTS, 3)
+    assert config.depth.calibration is None
+
+    seen.clear()
+    resume(fresh, monkeypatch)
+    check_clouds(recorded, seen)
+
+    seen.clear()
+    further = UCAFlowConfig.from_pretrained(fresh)
+    further.pretrained_path = fresh
+    trained_further = train(recorded, tmp_path / "further", further)
+    check_clouds(recorded, seen)
+
+    for checkpoint in (fresh, trained_further):
+        preprocess, _ = make_pre_post_processors(config, pretrained_path=str(checkpoint))
+        for index in (0, 7):
+            batch = preprocess(as_rollout_gives(index))
+            assert DEPTH_KEY not in batch
+            np.testing.assert_array_equal(batch[OBS_POINT_CLOUD][0].numpy(), live_cloud(index))
+            action = UCAFlowPolicy.from_pretrained(checkpoint).select_action(batch)
+            assert action.isfinite().all()
+
+
+def resume(checkpoint, monkeypatch):
+    """As a user does, for one more step."""
+    arguments = ["--resume=true", f"--config_path={checkpoint}/train_config.json", "--steps=2"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
+    lerobot_train.train()
+
+
+# The step alone -----------------------------------------------------------------------------------------------------
+
+
+def step(**changes):
+    return DepthToCloudProcessorStep(make_recipe(**changes).as_dict())
+
+
+def pure_cloud(index, recipe=None):
+    return (recipe or make_recipe()).make()([live_frame(index)])
+
+
+@pytest.mark.parametrize("leading", [(), (1,), (3,), (2, 2)])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_any_number_of_dimensions_before_the_image(leading, dtype):
+    n_frames = int(np.prod(leading))
+    frames = np.stack([live_frame(index)[..., 0] for index in range(n_frames)]).astype(dtype)
+    images = torch.from_numpy(frames.reshape(*leading, 1, 48, 64))
+    cloud = step().observation({DEPTH_KEY: images, "observation.state": torch.zeros(2)})[OBS_POINT_CLOUD]
+    assert cloud.dtype == torch.float32
+    assert cloud.shape == (*leading, N_CLOUD_POINTS, 3)
+    expected = np.stack([pure_cloud(index) for index in range(n_frames)])
+    np.testing.assert_array_equal(cloud.numpy().reshape(expected.shape), expected)
+
+
+def test_a_plain_picture_is_taken_too():
+    cloud = step().observation({DEPTH_KEY: live_frame(0)[..., 0]})[OBS_POINT_CLOUD]
+    np.testing.assert_array_equal(cloud.numpy(), pure_cloud(0))
+
+
+def test_a_cloud_stays_as_it_is():
+    observation = {OBS_POINT_CLOUD: torch.zeros(1, 5, 3), DEPTH_KEY: torch.zeros(1)}
+    assert step().observation(observation) is observation
+    assert DepthToCloudProcessorStep().observation(observation) is observation
+
+
+def test_a_camera_without_depth_is_told():
+    with pytest.raises(UserError, match=f"makes its cloud from {DEPTH_KEY}: {DEPTH_KEY} is missing.*use_depth: true"):
+        step().observation({"observation.images.front": torch.zeros(1, 3, 48, 64)})
+
+
+def test_wrong_images_are_told_in_one_line():
+    with pytest.raises(UserError, match="camera 'front' must be 48 x 64 numbers"):
+        step().observation({DEPTH_KEY: torch.zeros(1, 1, 20, 20)})
+    with pytest.raises(UserError, match="every pixel is 0 or NaN"):
+        step().observation({DEPTH_KEY: torch.zeros(1, 1, 48, 64)})
+    with pytest.raises(UserError, match="would fit metres"):
+        step().observation({DEPTH_KEY: torch.full((1, 1, 48, 64), 0.8)})
+
+
+def test_a_recipe_survives_being_written():
+    recipe = make_recipe(depth_unit=2.5e-4)
+    assert CloudRecipe.from_dict(recipe.as_dict()) == recipe
+    assert camera_of(DEPTH_KEY) == "front"
+
+
+@pytest.mark.parametrize("recipe", [{}, {"sources": 3, "crop": [], "n_points": 1}, {"sources": [{}]}])
+def test_a_damaged_recipe_is_refused(recipe):
+    with pytest.raises(UserError, match="A recipe needs sources, crop and n_points"):
+        DepthToCloudProcessorStep(recipe)
+
+
+def moved_camera(mm):
+    x, y, z = make_camera().position
+    return make_camera(position=(x + mm / 1e3, y, z))
+
+
+def test_another_installation_uses_its_own_calibration_and_says_how_far_it_is(calibrated, caplog):
+    moved = make_calibration(moved_camera(30))
+    moved.write(calibrated)
+    there = step()
+    assert "training, camera 'front' is 30.0 mm and 0.00 deg from where it was." in caplog.messages[0]
+    cloud = there.observation({DEPTH_KEY: live_frame(0)})[OBS_POINT_CLOUD].numpy()
+    np.testing.assert_array_equal(cloud, pure_cloud(0, make_recipe(camera=moved.camera)))
+    assert there.get_config()["recipe"] == make_recipe().as_dict()  # the checkpoint still knows its own
+
+
+def test_without_an_installation_the_calibration_of_training_is_used_and_told(caplog):
+    step()
+    (line,) = caplog.messages
+    assert line.startswith("Camera 'front': the calibration of the policy's training is used (2026-11-25).")
+
+
+def test_the_same_installation_is_silent(calibrated, caplog):
+    step()
+    assert not caplog.messages
+
+
+def test_an_installation_without_the_camera_is_refused(calibrated):
+    (calibrated / "123456.yaml").unlink()
+    make_calibration(make_camera("wrist"), serial="1").write(calibrated)
+    with pytest.raises(UserError, match="Camera 'front' needs a calibration, got those of wrist"):
+        step()
+
+
+def test_a_camera_on_the_arm_is_refused():
+    with pytest.raises(UserError, match="Camera 'front' moves with the tool"):
+        step(frame="tool")
+
+
+# Settings -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tiff(tmp_path_factory):
+    return write_depth_dataset(tmp_path_factory.mktemp("tiff") / "data", video=False)
+
+
+def test_training_from_depth_needs_a_calibration(tiff, tmp_path, monkeypatch):
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+    with pytest.raises(UserError, match="Camera 'front' needs a calibration, got none"):
+        train(tiff, tmp_path / "out", policy_config())
+    depth = DepthConfig(crop_low=CROP.low, crop_high=CROP.high, calibration=str(tmp_path / "missing"))
+    with pytest.raises(UserError, match="missing' must be a folder of calibrations"):
+        train(tiff, tmp_path / "out2", policy_config(depth=depth))
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_training_from_depth_needs_a_crop(tiff, tmp_path):
+    with pytest.raises(UserError, match="A cloud from depth needs a crop: give crop_low and crop_high"):
+        train(tiff, tmp_path / "out", policy_config(depth=DepthConfig()))
+    depth = DepthConfig(crop_low=(0, 0, 1), crop_high=(1, 1, 0))
+    with pytest.raises(UserError, match=r"low below high in each, got \(0.0, 0.0, 1.0\) and \(1.0, 1.0, 0.0\)"):
+        train(tiff, tmp_path / "out2", policy_config(depth=depth))
+
+
+def test_training_further_on_another_installations_data_is_refused(tiff, calibrated, tmp_path, monkeypatch):
+    fresh = train(tiff, tmp_path / "fresh", policy_config())
+    other = tmp_path / "other"
+    make_calibration(moved_camera(30)).write(other)
+    further = UCAFlowConfig.from_pretrained(fresh)
+    further.pretrained_path = fresh
+    further.depth.calibration = str(other)
+    with pytest.raises(UserError, match=r"in the dataset's camera 'front' is 30\.0 mm"):
+        train(tiff, tmp_path / "further", further)
+    monkeypatch.setenv(CALIBRATION_VARIABLE, str(other))
+    further.depth.calibration = None
+    assert train(tiff, tmp_path / "further2", further).is_dir()
+
+
+def test_a_policy_trained_on_unknown_clouds_does_not_take_depth(tiff, calibrated, dataset_root, tmp_path):
+    clouds = LeRobotDataset("test/random", root=dataset_root)
+    config = policy_config(depth=DepthConfig())
+    checkpoint = train(clouds, tmp_path / "clouds", config)
+    further = UCAFlowConfig.from_pretrained(checkpoint)
+    further.pretrained_path = checkpoint
+    further.depth.crop_low, further.depth.crop_high = CROP.low, CROP.high
+    with pytest.raises(UserError, match="was trained on clouds of unknown origin"):
+        train(tiff, tmp_path / "further", further)
+
+
+@pytest.mark.parametrize(
+    ("info", "near", "far", "unit"),
+    [
+        ({}, 0.01, 10.0, 1e-3),
+        ({"depth_unit": "mm", "video.depth_min": 0.01, "video.depth_max": 2.0}, 0.01, 2.0, 1e-3),
+        ({"depth_unit": "m"}, 0.01, 10.0, 1e-3),
+    ],
+)
+def test_the_encoders_range_is_taken_from_the_dataset(info, near, far, unit, tiff, calibrated):
+    features = {
+        **tiff.meta.features,
+        DEPTH_KEY: {**tiff.meta.features[DEPTH_KEY], "info": {"is_depth_map": True, **info}},
+    }
+    recipe = policy_config().depth.settle(features)
+    (source,) = recipe.sources
+    assert (source.near, source.far, source.calibration.depth_unit) == (near, far, unit)
+
+
+def test_a_cameras_own_unit_scales_the_encoders_range(tiff, calibrated):
+    make_calibration(depth_unit=2.5e-4).write(calibrated)
+    info = {"is_depth_map": True, "depth_unit": "mm", "video.depth_min": 0.08, "video.depth_max": 8.0}
+    recipe = policy_config().depth.settle({DEPTH_KEY: {"dtype": "video", "info": info}})
+    (source,) = recipe.sources
+    assert (source.near, source.far, source.calibration.depth_unit) == (0.02, 2.0, 2.5e-4)
