@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO, find_point_cloud
 from lerobot_uca.point_clouds.calibration import CalibrationError
@@ -30,7 +31,7 @@ class DepthConfig:
     # Highest corner of the crop.
     crop_high: tuple[float, float, float] | None = None
     # Points of the cloud. policy.n_points may look at fewer of them.
-    n_points: int = 512
+    n_points: int = within(512, least=1, most=100_000)
     # Folder of the cameras' calibrations, for training; by default $LEROBOT_UCA_CALIBRATION, which also holds on the
     # robot.
     calibration: str | None = None
@@ -43,6 +44,7 @@ class DepthConfig:
         Raises:
             UserError: if depth images need a calibration or a crop that is not there, or if another recipe is kept.
         """
+        check_bounds(self, "policy.depth")
         try:
             recipe = self._recipe_for(features)
         except CalibrationError as error:
