@@ -87,7 +87,7 @@ PROVENANCE = ("command", "commit", "versions", "cpu")
 
 
 def provenance() -> dict[str, str]:
-    """How a result was made: the command, the commit (+ if files differ from it), versions and the processor."""
+    """The command, the commit (+ if files differ from it), versions and the processor of this run."""
     script = Path(sys.argv[0])
     name = script.resolve().relative_to(ROOT) if script.resolve().is_relative_to(ROOT) else Path(script.name)
     installed = {distribution.metadata["Name"] for distribution in importlib.metadata.distributions()}

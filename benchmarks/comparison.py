@@ -1,4 +1,4 @@
-"""The paper's comparison on what two cores allow: UCA-Flow, its ablations and Simple DP3, by benchmarks/learning.py.
+"""The paper's comparison at a size for two cores: UCA-Flow, its ablations and Simple DP3, by benchmarks/learning.py.
 
 python benchmarks/comparison.py --expert=door.npz            # trains what is missing: all of it takes three hours
 python benchmarks/comparison.py --seeds 1 --tasks dial-turn  # a part of it

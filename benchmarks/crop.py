@@ -1,11 +1,11 @@
-"""Does the crop keep what a task is about? All 50 Meta-World tasks, many seeds; optionally a picture of their clouds.
+"""Check that the crop keeps a task's objects: all 50 Meta-World tasks, many seeds; optionally a picture of the clouds.
 
 python benchmarks/crop.py --seeds=50
 python benchmarks/crop.py --seeds=1 --picture=outputs/clouds.png
 
-Two shares are printed for each task, each the worst over the seeds: how many of the object and goal positions lie
-inside the crop (an object's origin may lie up to 3 cm below, in the table it stands on), and how many of the points
-that the camera sees of movable objects. Which body is movable is the simulator's knowledge; the crop goes by position.
+Two shares are printed for each task, each the worst over the seeds: of the object and goal positions, those inside the
+crop (an object's origin may lie up to 3 cm below, in the table it stands on), and of the points that the camera sees of
+movable objects, those inside. Which body is movable is the simulator's knowledge; the crop goes by position.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""How well a policy makes the actions of its own demonstrations: where it does not, the demonstrations tell why.
+"""Error of a policy's actions on its own demonstrations, by episode.
 
 python benchmarks/fit.py outputs/door/training/checkpoints/last/pretrained_model outputs/door/dataset
 

@@ -1,11 +1,11 @@
-"""What learns how fast: training and evaluation of a configuration on a task, a row of a CSV file for each seed.
+"""Train and evaluate a configuration on a task: a row of a CSV file for each seed.
 
 python benchmarks/learning.py results.csv --task=dial-turn --steps=600 --seeds 1 2
 python benchmarks/learning.py results.csv --task=dial-turn --seeds 1 2 --name=fast -- --policy.optimizer_lr=1e-3
 python benchmarks/learning.py results.csv --env=adroit_pointcloud --expert=door.npz --task=door --steps=1200 --seeds 1
 
-What follows `--` goes to lerobot-train. Demonstrations that are missing are made. Evaluated is as lerobot-eval does it,
-with its seeds, but without videos. A row that is there is not repeated, so a killed comparison goes on where it was.
+What follows `--` goes to lerobot-train. Missing demonstrations are collected. Evaluation is lerobot-eval's, with its
+seeds, but without videos. An existing row is not repeated, so a killed comparison continues where it was.
 """
 
 import argparse

@@ -78,7 +78,7 @@ def measure(dataset: Dataset[Any], indices: list[int], n_workers: int, n_batches
 
 
 def seconds_each(batches: Iterable[Any]) -> Iterator[float]:
-    """How long each batch takes to come."""
+    """Seconds until each batch arrives."""
     start = time.perf_counter()
     for _ in batches:
         now = time.perf_counter()

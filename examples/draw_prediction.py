@@ -1,4 +1,4 @@
-"""Draw what a trained policy sees and what it would do next: a PNG.
+"""Draw a trained policy's observation and predictions: a PNG.
 
     python examples/draw_prediction.py --checkpoint=outputs/.../pretrained_model --task=drawer-close --output=next.png
 

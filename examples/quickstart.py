@@ -1,6 +1,6 @@
 """From nothing to an evaluated policy: the public commands, in order, each printed so that it can be repeated.
 
-What is complete is reused; remove outputs/quickstart to start over.
+Complete results are reused; remove outputs/quickstart to start over.
 """
 
 import json
@@ -22,7 +22,7 @@ ENVIRONMENT = f"--env.type=metaworld_pointcloud --env.task={TASK}"
 
 
 class Step(NamedTuple):
-    """A command, how long it takes on two cores, what it writes, and the file that is there when it is complete."""
+    """A command, its duration on two cores, its output, and the file that exists when it is complete."""
 
     command: str
     takes: str
@@ -69,7 +69,7 @@ def main() -> None:
             print(f"  (complete: {step.complete})")
             continue
         print(f"  ({step.takes})", flush=True)
-        for outdated in STEPS[index:]:  # what is left of a killed run, and what was made from older results
+        for outdated in STEPS[index:]:  # remains of a killed run, and results of older inputs
             remove(outdated.output)
         run(step.command)
     report()

@@ -28,7 +28,7 @@ SMALL_POLICIES: dict[str, dict] = {
 
 
 def make_settings() -> dict:
-    """What every configuration needs besides sizes."""
+    """Settings of every configuration besides its sizes."""
     return {
         "input_features": {
             OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (N_POINTS, 3)),

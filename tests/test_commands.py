@@ -161,7 +161,7 @@ def test_an_unknown_task(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_exporting_what_is_no_checkpoint(tmp_path):
+def test_exporting_a_folder_without_a_checkpoint(tmp_path):
     assert "has no config.json. A checkpoint is a folder like" in fail("lerobot-uca-export", tmp_path)
 
 
@@ -204,27 +204,27 @@ def test_a_dataset_with_nan_points(tmp_path):
     assert not (tmp_path / "train").exists()
 
 
-def test_a_horizon_that_is_too_short(dataset_root, tmp_path):
+def test_a_short_horizon(dataset_root, tmp_path):
     line = fail(*train(dataset_root, tmp_path / "train", "--policy.horizon=3"))
     assert line.startswith(
         "error: policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = 4, got 3"
     )
 
 
-def test_training_into_a_folder_that_cannot_be_written(dataset_root, tmp_path):
+def test_training_into_an_unwritable_folder(dataset_root, tmp_path):
     (tmp_path / "file").write_text("")
     line = fail(*train(dataset_root, tmp_path / "file" / "train"))
     assert line.startswith(f"error: output_dir '{tmp_path}/file/train' cannot be written: '{tmp_path}/file' is not")
 
 
-def test_evaluation_into_a_folder_that_cannot_be_written(checkpoint, tmp_path):
+def test_evaluation_into_an_unwritable_folder(checkpoint, tmp_path):
     (tmp_path / "file").write_text("")
     command = ["lerobot-eval", f"--policy.path={checkpoint}", *ENVIRONMENT, "--eval.n_episodes=1"]
     line = fail(*command, f"--output_dir={tmp_path}/file/evaluation")
     assert line.endswith(f"cannot be written: '{tmp_path}/file' is not a writable folder.")
 
 
-def test_collecting_into_a_folder_that_cannot_be_written(tmp_path):
+def test_collecting_into_an_unwritable_folder(tmp_path):
     (tmp_path / "file").write_text("")
     command = ["lerobot-uca-collect", *ENVIRONMENT, "--repo_id=a/b", "--n_episodes=1", f"--root={tmp_path}/file/data"]
     assert fail(*command).startswith(f"error: Cannot write '{tmp_path}/file/data'")

@@ -1,4 +1,4 @@
-"""What this package changes in LeRobot, and what it leaves alone."""
+"""The changes that this package makes in LeRobot, and their limits."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""How the package is put together and found."""
+"""The package's parts, its wheel and its discovery by LeRobot."""
 
 import ast
 import importlib.metadata

@@ -57,7 +57,7 @@ def sample_intervals(batch_size: int, device: torch.device | str, *, mean: float
 
 
 class Velocities(NamedTuple):
-    """What is compared with the target velocity e - x; each (B, T, A).
+    """The two estimates that are compared with the target velocity e - x; each (B, T, A).
 
     Args:
         V: the composite velocity of the u branch, u + h sg(D_t u).

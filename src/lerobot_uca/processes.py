@@ -1,4 +1,4 @@
-"""How processes end: a command by a signal, and a worker when its parent has ended."""
+"""The end of processes: of a command by a signal, of a worker when its parent has ended."""
 
 import multiprocessing
 import os

@@ -158,12 +158,12 @@ def test_a_processor_step_that_a_trace_would_not_hold_for(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["nowhere/at/all", "no-such-user/no-such-policy"])
-def test_a_checkpoint_that_is_nowhere(tmp_path, name):
+def test_a_missing_checkpoint(tmp_path, name):
     with pytest.raises(UserError, match=f"'{name}' is not a folder and could not be downloaded from the Hub"):
         export(name, tmp_path / "policy.onnx")
 
 
-def test_a_file_that_cannot_be_written(checkpoint, tmp_path):
+def test_an_unwritable_file(checkpoint, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="Cannot write"):
         export(str(checkpoint), tmp_path / "file" / "policy.onnx")
@@ -176,7 +176,7 @@ def test_nothing_is_written_if_onnxruntime_computes_something_else(checkpoint, t
     assert not list(tmp_path.iterdir())
 
 
-def test_an_onnxruntime_that_is_too_old(exported, monkeypatch):
+def test_an_old_onnxruntime(exported, monkeypatch):
     monkeypatch.setattr(onnxruntime, "__version__", "1.9.0")
     with pytest.raises(RuntimeError, match=r"onnxruntime must be at least 1\.12, got 1\.9\.0"):
         OnnxPolicy(exported)
@@ -192,7 +192,7 @@ def test_an_onnxruntime_that_is_too_old(exported, monkeypatch):
         (np.zeros((N_POINTS, 3)), np.full(N_STATES, 1e30), r"'state' must lie within \+-1e\+12, got 1\.0e\+30"),
     ],
 )
-def test_observations_that_do_not_fit(exported, point_cloud, state, message):
+def test_observations_of_wrong_shapes(exported, point_cloud, state, message):
     with pytest.raises(ValueError, match=message):
         OnnxPolicy(exported).select_action(point_cloud, state)
 
@@ -215,7 +215,7 @@ def test_a_model_with_other_inputs(tmp_path):
         ("noise", np.full((4, N_ACTIONS), np.inf), "'noise' must be finite"),
     ],
 )
-def test_plans_from_inputs_that_do_not_fit(exported, name, value, message):
+def test_plans_from_inputs_of_wrong_shapes(exported, name, value, message):
     steps = {"point_cloud": np.zeros((2, N_POINTS, 3)), "state": np.zeros((2, N_STATES)), "noise": None}
     with pytest.raises(ValueError, match=message):
         OnnxPolicy(exported).plan(*{**steps, name: value}.values())
@@ -234,7 +234,7 @@ class Diverged(torch.nn.Module):
         return (noise + point_cloud.sum() + state.sum()) * torch.inf
 
 
-def test_actions_that_are_not_finite_are_never_handed_out(tmp_path):
+def test_infinite_actions_are_never_returned(tmp_path):
     shapes = {"point_cloud": (2, N_POINTS, 3), "state": (2, N_STATES), "noise": (4, N_ACTIONS)}
     inputs = tuple(torch.zeros(shape) for shape in shapes.values())
     torch.onnx.export(Diverged(), inputs, str(tmp_path / "policy.onnx"), dynamo=False, input_names=list(shapes))
@@ -268,7 +268,7 @@ def test_a_file_with_weights_in_other_files(exported, tmp_path, location):
         OnnxPolicy(tmp_path / "folder" / "policy.onnx")
 
 
-def test_a_file_that_is_not_a_model(tmp_path):
+def test_an_invalid_model_file(tmp_path):
     (tmp_path / "policy.onnx").write_bytes(b"text")
     with pytest.raises(ValueError, match=r"policy\.onnx' cannot be opened as an ONNX model"):
         OnnxPolicy(tmp_path / "policy.onnx")

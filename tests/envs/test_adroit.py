@@ -23,7 +23,7 @@ def env(request):
     return env
 
 
-def test_observations_are_what_the_spaces_say(env):
+def test_observations_fit_the_spaces(env):
     observation, info = env.reset(seed=0)
     assert observation["point_cloud"].shape == (1024, 3)
     assert observation["agent_pos"].shape == (24,)
@@ -222,7 +222,7 @@ def test_settings_that_are_none():
         AdroitPointCloudEnv("paper")
 
 
-def test_actions_that_are_none(env):
+def test_invalid_actions(env):
     with pytest.raises(UserError, match=rf"Adroit {env.task}: an action must be {env.n_actions} finite numbers"):
         env.step(np.zeros(3))
 

@@ -24,7 +24,7 @@ def env():
     return env
 
 
-def test_observations_are_what_the_spaces_say(env):
+def test_observations_fit_the_spaces(env):
     observation, info = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     assert info == {"is_success": False}
@@ -150,7 +150,7 @@ def test_no_task(task):
         make_env_config("metaworld_pointcloud", task=task).get_env_processors()
 
 
-def test_an_environment_of_a_task_that_is_none():
+def test_an_unknown_task():
     with pytest.raises(UserError, match="Unknown task 'foo'"):
         MetaworldPointCloudEnv("foo")
     with pytest.raises(UserError, match="An environment has one task, got 'hard'"):
@@ -163,7 +163,7 @@ def test_no_points():
 
 
 @pytest.mark.parametrize("action", [np.zeros(3), np.array([0, np.nan, 0, 0])])
-def test_actions_that_are_none(env, action):
+def test_invalid_actions(env, action):
     with pytest.raises(UserError, match="an action must be 4 finite numbers"):
         env.step(action)
 

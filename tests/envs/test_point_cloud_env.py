@@ -1,4 +1,4 @@
-"""What holds for every environment, as LeRobot's commands make it."""
+"""Contracts of every environment, as LeRobot's commands make it."""
 
 import numpy as np
 import pytest

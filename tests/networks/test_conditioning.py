@@ -68,7 +68,7 @@ def test_ablations_have_the_methods_size(dim, n_layers):
 
 @pytest.mark.parametrize("conditioning", ["cross_attention", "adaln"])
 def test_ablations_keep_the_conditions_as_they_are(conditioning):
-    """What the blocks read of the conditions is the same in every layer, whatever the actions are."""
+    """The blocks read the same conditions in every layer, whatever the actions are."""
     network, seen = make(conditioning, n_layers=3), []
     for block in network.blocks:
         block.register_forward_hook(lambda _, inputs, __: seen.append(inputs[1]))

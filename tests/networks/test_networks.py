@@ -40,7 +40,7 @@ def test_going_back_through_the_winners_alone_gives_the_plain_encoders_gradients
         torch.testing.assert_close(encoder(points), plain)
 
 
-def test_leaving_out_what_nobody_reads_changes_no_action():
+def test_skipping_unread_tokens_changes_no_action():
     torch.manual_seed(0)
     block = Block(dim=16, n_heads=2)
     tokens = torch.randn(2, 10, 16)

@@ -1,4 +1,4 @@
-"""What holds for every policy that this package registers."""
+"""Contracts of every policy that this package registers."""
 
 import pytest
 import torch

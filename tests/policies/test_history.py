@@ -1,4 +1,4 @@
-"""Which frames plans see, by the definition: steps -(O-1)s, ..., -s, 0 of every planning step."""
+"""The frames that plans see, by the definition: steps -(O-1)s, ..., -s, 0 of every planning step."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What LeRobot and its users rely on."""
+"""The contract with LeRobot and its users."""
 
 import copy
 import dataclasses

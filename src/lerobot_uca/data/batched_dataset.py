@@ -42,7 +42,7 @@ class Columns:
         self.row_of_frame[self.tensors["index"]] = torch.arange(len(self.tensors["index"]))
 
     def samples(self, reader: DatasetReader, rows: Sequence[int]) -> list[Sample]:
-        """What `reader.get_item` gives for each row."""
+        """The same as `reader.get_item` for each row."""
         n_rows = len(self.tensors["index"])
         row = torch.as_tensor(rows)
         if len(row) and (int(row.min()) < -n_rows or int(row.max()) >= n_rows):

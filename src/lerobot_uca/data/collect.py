@@ -32,7 +32,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO
 from lerobot_uca.hub import uploading
 
 FIRST_SEED = 1_000_000
-"""Where the seeds of demonstrations start. LeRobot evaluates from seed 1000 upwards unless told otherwise."""
+"""First seed of the demonstrations. LeRobot evaluates from seed 1000 upwards unless told otherwise."""
 
 MAX_ATTEMPTS = 20
 """Attempts for each wanted episode before the collector gives up."""
@@ -86,7 +86,7 @@ def collect(config: CollectConfig) -> LeRobotDataset:
     except HFValidationError as error:
         raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
     env_config.validate()
-    attempts = _attempts(config, env_config)  # before anything is written: there may be no such expert
+    attempts = _attempts(config, env_config)  # before anything is written: the expert may not exist
     root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
     with whole_folder(root, overwrite=config.overwrite) as unfinished:
         _write(config, env_config, attempts, unfinished)

@@ -19,7 +19,7 @@ from lerobot_uca.processes import end_with_parent
 
 
 class Demonstration(NamedTuple):
-    """One episode: what was seen before each of L steps, what was done, and whether it is worth keeping."""
+    """One episode of L steps: the observation before each step, the action, and whether to keep it."""
 
     seen: NDArray[Any]  # (L, N, 3) point clouds or (L, 1, H, W) depth images
     state: NDArray[np.float32]  # (L, S)
@@ -48,9 +48,9 @@ def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> D
 def demonstrations(
     env_factory: Callable[[], PointCloudEnv], attempts: Iterator[Attempt], *, n_wanted: int
 ) -> Generator[Demonstration]:
-    """Episodes of the attempts in their order, until n_wanted of them were successful or there are no more.
+    """Episodes of the attempts in order, until n_wanted were successful or the attempts are used up.
 
-    They are made by one process a core.
+    One process a core runs them.
     """
     n_workers = os.cpu_count() or 1
     pool = ProcessPoolExecutor(
@@ -60,7 +60,7 @@ def demonstrations(
         pending: deque[Future[Demonstration]] = deque()
         n_missing = n_wanted
         while n_missing:
-            # Never more than may still be needed: leaving the pool waits for the episodes that are running.
+            # Never more than may still be needed: leaving the pool waits for running episodes.
             n_idle = max(0, min(n_missing, n_workers + 1) - len(pending))
             pending.extend(pool.submit(demonstrate, env_factory, attempt) for attempt in islice(attempts, n_idle))
             if not pending:

@@ -34,7 +34,7 @@ FILES = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
 """Of a checkpoint, besides its weights."""
 
 TOLERANCE = 1e-4
-"""How far the file's actions may be from the policy's, as a share of the largest: float32's rounding is far below."""
+"""Largest difference of the file's actions from the policy's, as a share of the largest; float32 rounds far below."""
 
 
 class RawPolicy:

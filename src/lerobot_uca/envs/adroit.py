@@ -33,18 +33,18 @@ PICTURE_CAMERA = Camera.from_fovy("vil_camera", (0.0, -1.2, 1.2), TILTED, fovy=4
 
 
 class Outcome(NamedTuple):
-    """What an action has led to, as the simulator tells it."""
+    """The result of an action, as the simulator reports it."""
 
     observation: Array
     """The simulator's own."""
     is_reached: bool
-    """Whether the simulator calls the goal reached."""
+    """The simulator calls the goal reached."""
     is_last: bool
-    """Whether the episode's time is over."""
+    """The episode's time is over."""
 
 
 class Task(NamedTuple):
-    """What one task has of its own.
+    """One task's simulator, camera and measures of success.
 
     Args:
         description: what it asks for, in English.
@@ -67,7 +67,7 @@ class Task(NamedTuple):
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """What each number of the task's action moves."""
+        """The joint that each number of the task's action moves."""
         return self.arm + HAND
 
 
@@ -127,7 +127,7 @@ def resolve(spec: str | None) -> dict[str, tuple[str, ...]]:
 
 
 class Verdict(NamedTuple):
-    """What an environment reports of an outcome."""
+    """An environment's report on an outcome."""
 
     terminated: bool
     is_success: bool
@@ -151,7 +151,7 @@ SUCCESS = {"final": judge_final, "any": judge_any}
 
 
 def judge_of(success: str) -> Callable[[Task, Outcome], Verdict]:
-    """What decides about success, by its name in `SUCCESS`.
+    """The measure of success of that name in `SUCCESS`.
 
     Raises:
         UserError: for another name.

@@ -29,7 +29,7 @@ from lerobot_uca.registry import register
 
 @dataclass
 class PointCloudEnvConfig(EnvConfig):
-    """What all point-cloud environments share: features, task names and vector environments."""
+    """Base of the point-cloud environments: features, task names and vector environments."""
 
     # Points of each cloud.
     n_points: int = within(512, least=1, most=100_000)
@@ -83,15 +83,15 @@ class PointCloudEnvConfig(EnvConfig):
 
     @abstractmethod
     def task_description(self, task: str) -> str:
-        """What a task asks for, in English."""
+        """A task's instruction, in English."""
 
     @abstractmethod
     def action_names(self) -> list[str]:
-        """What each number of an action means."""
+        """Names of an action's numbers."""
 
     @abstractmethod
     def state_names(self) -> list[str]:
-        """What each number of `agent_pos` means."""
+        """Names of the numbers of `agent_pos`."""
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

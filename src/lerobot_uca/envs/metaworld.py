@@ -66,7 +66,7 @@ def _lerobot_table() -> dict[str, dict[str, Any]]:
 
 @cache
 def task_descriptions() -> dict[str, str]:
-    """What each of the 50 tasks asks for, in English, by name without '-v3'."""
+    """The instruction of each of the 50 tasks, in English, by name without '-v3'."""
     return {name.removesuffix("-v3"): text for name, text in _lerobot_table()["TASK_DESCRIPTIONS"].items()}
 
 
@@ -126,7 +126,7 @@ class MetaworldPointCloudEnv(PointCloudEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode: the seed alone decides which. Without a seed, one is drawn. There are no options."""
+        """Start an episode, which the seed alone decides. Without a seed, one is drawn. Options are ignored."""
         super().reset(seed=seed, options=options)
         # A fresh simulator each time: some tasks keep state of the last episode, and the seed alone must decide.
         self._simulator = _make_simulator(self.task)

@@ -1,4 +1,4 @@
-"""What all simulated tasks with point-cloud observations do alike. A benchmark adds its simulator and its data."""
+"""Base of the simulated tasks with point-cloud observations. A benchmark adds its simulator and its data."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class PointCloudEnv(gym.Env[Any, Any]):
 
     benchmark: ClassVar[str]
     min_successful_steps: ClassVar[int]
-    """What makes an episode a demonstration."""
+    """Successful steps that make an episode a demonstration."""
     render_mode = "rgb_array"
 
     def __init__(
@@ -115,7 +115,7 @@ class PointCloudEnv(gym.Env[Any, Any]):
         return ()
 
     def _clipped(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What is executed of an action."""
+        """The action as it is executed."""
         if np.shape(action) != (self.n_actions,) or not np.all(np.isfinite(action)):
             raise UserError(
                 f"{self.benchmark} {self.task}: an action must be {self.n_actions} finite numbers, got {action}."

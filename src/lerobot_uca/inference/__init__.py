@@ -1,1 +1,1 @@
-"""How networks are computed at inference: PyTorch, traced runtimes, torch.compile."""
+"""Engines that compute networks at inference: PyTorch, traced runtimes, torch.compile."""

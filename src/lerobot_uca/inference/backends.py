@@ -25,7 +25,7 @@ _warned: set[str] = set()
 
 
 def make_backend(name: str) -> Callable[[Function], Function]:
-    """How a backend computes a PyTorch function. PyTorch itself, with one warning, if the engine is not installed.
+    """The class that computes a PyTorch function; PyTorch itself, with one warning, without the engine's package.
 
     Args:
         name: one of `BACKENDS`.

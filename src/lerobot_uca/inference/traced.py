@@ -50,7 +50,7 @@ class TracedFunction(ABC):
 
     runtime: ClassVar[str]
     tolerance: ClassVar[float] = 1e-4
-    """How far results may be from PyTorch's, as a share of the largest: float32's rounding is far below."""
+    """Largest difference from PyTorch's results, as a share of the largest; float32 rounds far below."""
 
     def __init__(self, eager: Function) -> None:
         self.eager = eager
@@ -63,7 +63,7 @@ class TracedFunction(ABC):
 
     @abstractmethod
     def open(self, model: bytes, input_shapes: Sequence[torch.Size], n_threads: int) -> Run:
-        """What computes an ONNX model, whose inputs are in order."""
+        """Open an ONNX model, whose inputs are in order."""
 
     def __call__(self, network: nn.Module, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The same as `eager(network, *inputs)` up to rounding. Inputs are float32, the first dimension is the batch.
@@ -178,7 +178,7 @@ def to_onnx(
 
 
 class _Function(nn.Module):
-    """What the exporter takes: a module."""
+    """A function as the module that the exporter needs."""
 
     def __init__(self, function: Callable[..., Tensor | tuple[Tensor, ...]], network: nn.Module) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""How conditions reach the actions: UCA-Flow's way and the two it is compared with (paper section 4.2)."""
+"""The ways in which conditions reach the actions: UCA-Flow's and its two ablations (paper section 4.2)."""
 
 from lerobot_uca.networks.adaln import AdaLNTransformer
 from lerobot_uca.networks.cross_attention import CrossAttentionTransformer

@@ -1,4 +1,4 @@
-"""The ablation '-Unified/c': action tokens look at the conditions by cross-attention, the conditions stay as they are.
+"""The ablation '-Unified/c': action tokens read the conditions by cross-attention, the conditions do not change.
 
 Letters as in `transformer`.
 """

@@ -49,7 +49,7 @@ def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     y' = P' v + P v' with P' = P (a' - sum(P a')). A softmax's derivative is symmetric, so that its backward pass
     computes P'. Either all three have a tangent or none has.
 
-    It is written out because PyTorch's fused `scaled_dot_product_attention` has no forward-mode derivative (and, for so
+    Written out because PyTorch's fused `scaled_dot_product_attention` has no forward-mode derivative (and, for so
     few tokens, a backward pass that takes eight times as long).
     """
     (q, q_tangent), (k, k_tangent), (v, v_tangent) = map(forward_ad.unpack_dual, (q, k, v))

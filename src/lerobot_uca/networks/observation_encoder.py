@@ -10,12 +10,11 @@ CPU_CLOUDS = 16  # at once: what they need stays in a CPU's cache; with more, th
 
 
 class PointEncoder(nn.Module):
-    """A small PointNet, the same in DP3, FlowPolicy and MP1: per-point layers, max over the points, projection.
+    """A small PointNet, the same in DP3, FlowPolicy and MP1: `project(relu(per_point(p)).amax(-2))`.
 
-    The order of the points does not matter.
-
-    In training, a point gets a gradient only through the features in which it is its cloud's largest. So the winners
-    are found without a graph, and only they, 20 to 40 % of the points, pass the layers once more to be differentiated.
+    The order of the points does not matter. A point receives a gradient only through the features in which it has its
+    cloud's largest value. So training finds these winners, 20 to 40 % of the points, without a graph, and computes only
+    them once more to differentiate: the same gradients for less time.
     """
 
     def __init__(self, widths: tuple[int, ...], n_features: int) -> None:
@@ -38,7 +37,7 @@ class PointEncoder(nn.Module):
         return torch.cat([_largest_point(self.per_point(some)) for some in _some_at_once(clouds)])
 
     def _largest_of_winners(self, clouds: Tensor) -> Tensor:
-        """The same with a graph to go back through."""
+        """The same values, (B, N, 3) to (B, C), with a graph for the gradients."""
         with torch.no_grad():
             winners = torch.cat([self.per_point(some).max(dim=1).indices for some in _some_at_once(clouds)])
         wins = torch.zeros(clouds.shape[:2], dtype=torch.bool, device=clouds.device).scatter_(1, winners, True)

@@ -24,7 +24,7 @@ class SelfAttention(nn.Module):
         self.out = Linear(dim, dim)
 
     def forward(self, tokens: Tensor, n_out: int | None = None) -> Tensor:
-        """(B, S, D) to what the last n_out tokens (without it all) get from all, (B, n_out, D)."""
+        """The last n_out tokens (default: all) attend to all tokens: (B, S, D) to (B, n_out, D)."""
         qkv = self.qkv(tokens).unflatten(-1, (3, self.n_heads, -1))
         q, k, v = qkv.permute(2, 0, 3, 1, 4).contiguous()  # (B, heads, S, d); one copy instead of one for each product
         if n_out is not None:
@@ -42,7 +42,7 @@ class Block(nn.Module):
         self.feed_forward = nn.Sequential(LayerNorm(dim), Linear(dim, 4 * dim), nn.GELU(), Linear(4 * dim, dim))
 
     def forward(self, tokens: Tensor, n_out: int | None = None) -> Tensor:
-        """(B, S, D) to the last n_out tokens, without it to all, (B, n_out, D)."""
+        """The last n_out tokens (default: all) after the block: (B, S, D) to (B, n_out, D)."""
         attended = self.attention(self.norm(tokens), n_out)
         tokens = (tokens if n_out is None else tokens[:, -n_out:]) + attended
         return tokens + self.feed_forward(tokens)
@@ -105,9 +105,9 @@ class UnifiedTransformer(ConditionActionTransformer):
     block = Block
 
     def refine(self, P: Tensor, Y: Tensor) -> Tensor:
-        """All tokens go through the blocks; of the last one only the actions are read."""
+        """All tokens go through the blocks; the last block computes the action tokens only."""
         tokens = torch.cat([P, Y], dim=1)
         *earlier, last = self.blocks
         for block in earlier:
             tokens = block(tokens)
-        return last(tokens, n_out=Y.shape[1])  # what nobody reads is not computed
+        return last(tokens, n_out=Y.shape[1])  # the head does not read the others

@@ -28,7 +28,7 @@ def consistency_flow_loss(
     n_segments: int,
     alpha: float,
 ) -> Tensor:
-    """How far two neighbouring times t < r disagree, ||f_t - f_r||^2 + alpha ||v_t - v_r||^2 as means, (B,).
+    """The disagreement of two neighbouring times t < r, ||f_t - f_r||^2 + alpha ||v_t - v_r||^2 as means, (B,).
 
     f = z + (end - time) v is where the segment that holds t ends; at r = 1 that is x itself, the one place where the
     actions come in. FlowPolicy's paper compares with averaged weights; its code, and so this, trains both sides.

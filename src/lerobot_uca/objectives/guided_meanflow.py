@@ -50,7 +50,7 @@ def guided_meanflow_losses(
 def guided_target(
     network: IntervalNetwork, z: Tensor, t: Tensor, r: Tensor, o: Tensor, *, v: Tensor, n_instants: int
 ) -> Tensor:
-    """What u(z, t, r) should be: v^ - (t - r) du/dt with the guided velocity v^ = 2 v - u(z, t, t), (B, T, A).
+    """The target of u(z, t, r): v^ - (t - r) du/dt with the guided velocity v^ = 2 v - u(z, t, t), (B, T, A).
 
     MP1's paper calls this classifier-free guidance. In its code, and so here, u keeps its condition o.
 

@@ -90,7 +90,7 @@ class PictureCamera:
 
 
 def _distances(caster: RayCaster, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker]) -> Array:
-    """How far the nearest surface or marker is along each ray, (R,) [m]."""
+    """The distance to the nearest surface or marker along each ray, (R,) [m]."""
     distance = caster.cast(model, data).distance
     for marker in markers:
         to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)

@@ -120,7 +120,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Crop:
-    """An axis-aligned box in the world frame: what lies outside is no part of the cloud.
+    """An axis-aligned box in the world frame; points outside are not part of the cloud.
 
     Args:
         low, high: opposite corners [m].
@@ -130,11 +130,11 @@ class Crop:
     high: tuple[float, float, float]
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
-        """Which of the points (N, 3) lie inside, (N,)."""
+        """Whether each of the points (N, 3) lies inside, (N,)."""
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
     def span(self, origin: Array, directions: Array) -> tuple[Array, Array]:
-        """Where rays from origin (3,) along directions (R, 3) enter and leave the box: two distances [m], (R,) each.
+        """Distances [m] at which rays from origin (3,) along directions (R, 3) enter and leave the box, (R,) each.
 
         A ray that misses the box has enter > leave. It cannot give a point, so it need not be cast.
         """
@@ -180,7 +180,7 @@ def sample_farthest(points: NDArray[np.floating[Any]], n_points: int) -> NDArray
     than asked for, all of them are repeated in turn: zeros would be points at the world's origin.
 
     Raises:
-        ValueError: if there is no point at all.
+        ValueError: if the cloud is empty.
     """
     if len(points) == 0:
         raise ValueError("The point cloud is empty: 0 points, at least 1 is needed.")

@@ -18,7 +18,7 @@ Indices = NDArray[np.intp]
 
 
 class Hits(NamedTuple):
-    """What R rays hit."""
+    """The first hits of R rays."""
 
     distance: Array  # (R,) [m], inf where nothing was hit
     geom: NDArray[np.int32]  # (R,), -1 where nothing was hit
@@ -83,7 +83,7 @@ class RayCaster:
         return hits
 
     def _rays_near(self, model: mujoco.MjModel, data: mujoco.MjData) -> Indices:
-        """Which rays (R',) meet the bounding sphere of a geom that moves."""
+        """The rays (R',) that meet the bounding sphere of a moving geom."""
         to_centre = data.geom_xpos[self._moving] - self.origin
         tangent_squared = np.sum(to_centre**2, axis=1) - model.geom_rbound[self._moving] ** 2
         # The rays that meet a sphere are those that make no larger an angle with its centre than its tangents do.
@@ -118,6 +118,6 @@ class RayCaster:
 
 
 def _is_visible(model: mujoco.MjModel) -> NDArray[np.bool_]:
-    """Which geoms rays may hit, (ngeom,)."""
+    """The geoms that rays may hit, (ngeom,)."""
     is_transparent = (model.geom_matid < 0) & (model.geom_rgba[:, 3] == 0)
     return (VISIBLE_GROUPS[model.geom_group] == 1) & ~is_transparent

@@ -1,4 +1,4 @@
-"""What all point-cloud policies of this package have in common: observations, horizons, encoder, training recipe."""
+"""Configuration shared by the point-cloud policies: observations, horizons, encoder, training recipe."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -64,7 +64,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # What computes actions, the same to rounding: eager (PyTorch, the reference), openvino or onnxruntime (on a CPU;
     # faster for small networks; on other devices it is PyTorch), compile (torch.compile, on a GPU with CUDA graphs).
     # openvino_bfloat16 is faster still where the processor has bfloat16 instructions, UCA-Flow's actions within
-    # about 2 % of their range (README).
+    # about 2 % of their range (docs/inference.md).
     inference: str = "eager"
     # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). LeRobot also evaluates with it
     # during training; lerobot-eval uses float32 unless told policy.use_amp=true.
@@ -173,7 +173,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
 
     @property
     def executed(self) -> slice:
-        """Which entries of a prediction are executed."""
+        """The executed entries of a prediction."""
         return slice(self.obs_span, self.obs_span + self.n_action_steps)
 
     @property

@@ -21,7 +21,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     """
 
     # Width D of the tokens. With 256 there are 3.5 million parameters, half of Simple DP3's; 128 gives
-    # a quarter of them and is what the README's results were measured with.
+    # a quarter of them; docs/results.md was measured with it.
     dim: int = within(256, least=2, most=8192)
     # Transformer blocks.
     n_layers: int = within(4, least=1, most=128)
@@ -45,7 +45,8 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # See gamma.
     c: float = within(1e-3, above=0)
     # t and r are two draws from sigmoid(N(interval_mean, interval_std^2)); MP1's values. They rarely draw the whole
-    # interval [0, 1], which is what one step needs: a wider distribution got further in short trainings (README).
+    # interval [0, 1], which is what one step needs: a wider distribution got further in short trainings
+    # (docs/results.md).
     interval_mean: float = within(-0.4, least=-10, most=10)
     # See interval_mean.
     interval_std: float = within(1.0, above=0, most=10)

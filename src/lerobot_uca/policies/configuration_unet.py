@@ -1,4 +1,4 @@
-"""What the baselines' configurations have in common: the size of the U-Net."""
+"""Configuration shared by the baselines: the size of the U-Net."""
 
 from dataclasses import dataclass
 from typing import Any, override

@@ -35,7 +35,7 @@ from lerobot_uca.policies.publishing import PublishedPolicy
 
 
 class Model(nn.Module):
-    """What is trained: an encoder of observations and a network that makes actions from its features."""
+    """The trained networks: an encoder of observations and a generator of actions from its features."""
 
     def __init__(self, encoder: nn.Module, generator: nn.Module) -> None:
         super().__init__()

@@ -147,7 +147,7 @@ def _with_valid_points(cloud: Tensor, mask: Tensor) -> Tensor:
 
 
 def _is_single(transition: EnvTransition) -> bool:
-    """Whether this is one frame or one window, such as `dataset[0]`, and no batch."""
+    """Whether this is one frame or one window without a batch dimension, such as `dataset[0]`."""
     index = (transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}).get("index")
     is_single_row = isinstance(index, Tensor) and index.ndim == 0
     return is_single_row or transition[TransitionKey.OBSERVATION][OBS_POINT_CLOUD].ndim == 2

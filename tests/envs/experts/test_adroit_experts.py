@@ -1,4 +1,4 @@
-"""Who demonstrates: weights or a Minari dataset, made here from the weights."""
+"""Adroit's demonstrators: weights, or a Minari dataset made here from the weights."""
 
 from itertools import islice
 
@@ -102,7 +102,7 @@ def test_without_an_expert_the_error_says_where_to_get_one():
 
 def test_weights_of_another_task(adroit_experts):
     path = adroit_experts / "hammer.npz"
-    line = f"'{path}' is no expert of door: it maps 46 observations to 26 actions, door has 39 and 28."
+    line = f"'{path}' does not fit door: it maps 46 observations to 26 actions, door has 39 and 28."
     with pytest.raises(UserError) as caught:
         attempts("door", str(path), first_seed=0)
     assert str(caught.value) == line
@@ -110,20 +110,20 @@ def test_weights_of_another_task(adroit_experts):
 
 @pytest.mark.usefixtures("datasets")
 def test_a_dataset_of_another_task():
-    line = r"Minari dataset 'local/pen/seeds-v0' is none of door: its observation_space has shape \(45,\), door has"
+    line = r"Minari dataset 'local/pen/seeds-v0' does not fit door: its observation_space has shape \(45,\), door needs"
     with pytest.raises(UserError, match=line):
         attempts("door", "minari:local/pen/seeds-v0", first_seed=0)
 
 
 @pytest.mark.parametrize("dataset_id", ["D4RL/nothing/expert-v2", "not an id"])
-def test_a_dataset_that_does_not_exist(dataset_id, tmp_path, monkeypatch):
+def test_a_missing_dataset(dataset_id, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    with pytest.raises(UserError, match=rf"^There is no Minari dataset '{dataset_id}' here, nor could it be fetched: "):
+    with pytest.raises(UserError, match=rf"^Minari dataset '{dataset_id}' is not on this computer and could not be "):
         attempts("door", f"minari:{dataset_id}", first_seed=0)
 
 
 @pytest.mark.usefixtures("datasets")
-def test_an_episode_that_does_not_say_how_it_started():
+def test_an_episode_without_its_start():
     tries = attempts("door", "minari:local/door/nothing-v0", first_seed=0)
     with pytest.raises(UserError, match="Cannot replay episode 0 of Minari dataset 'local/door/nothing-v0': it says"):
         next(tries)
@@ -133,7 +133,7 @@ def test_an_episode_that_does_not_say_how_it_started():
 def test_an_episode_that_starts_elsewhere():
     attempt = next(attempts("door", "minari:local/door/seeds-v0", first_seed=0))
     moved = attempt._replace(reset={"seed": 99})
-    with pytest.raises(UserError, match=r"Cannot replay episode 0 of .*: door starts in another state than it has"):
+    with pytest.raises(UserError, match=r"Cannot replay episode 0 of .*: door starts in a state that differs"):
         demonstrate(lambda: AdroitPointCloudEnv("door", n_points=16), moved)
 
 

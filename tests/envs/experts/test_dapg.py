@@ -148,7 +148,7 @@ def test_a_pickle_is_read_as_the_policy_it_holds(pickler, protocol, mjrl, weight
 
 def test_a_policy_fits_one_task_only(npz, weights):
     weights.check_task("door", npz)
-    line = r"door\.npz' is no expert of relocate: it maps 39 observations to 28 actions, relocate has 39 and 30\."
+    line = r"door\.npz' does not fit relocate: it maps 39 observations to 28 actions, relocate has 39 and 30\."
     with pytest.raises(UserError, match=line):
         weights.check_task("relocate", npz)
     for task in TASKS:
@@ -175,7 +175,7 @@ def test_a_pickle_that_imports_something_is_refused_and_does_nothing(function, a
     harm = tmp_path / "harm"
     thing = Imports(function, *(a.format(harm) if isinstance(a, str) else a for a in arguments))
     path = write(tmp_path / "door.pickle", pickled({"policy": thing}))
-    with pytest.raises(UserError, match=rf"'{path}' holds no DAPG policy: it asks for \w+\.\w+, which no such policy"):
+    with pytest.raises(UserError, match=rf"'{path}' does not contain a DAPG policy: it asks for \w+\.\w+, which no "):
         DAPGWeights.read(path)
     assert not harm.exists()
 
@@ -183,7 +183,7 @@ def test_a_pickle_that_imports_something_is_refused_and_does_nothing(function, a
 def test_names_of_torch_are_never_run(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "load", lambda *_: pytest.fail("was run"))
     thing = Imports(torch.save, {}, str(tmp_path / "harm"))
-    with pytest.raises(UserError, match="holds no DAPG policy"):
+    with pytest.raises(UserError, match="does not contain a DAPG policy"):
         DAPGWeights.read(write(tmp_path / "door.pickle", pickled(thing)))
     assert not (tmp_path / "harm").exists()
 
@@ -191,7 +191,7 @@ def test_names_of_torch_are_never_run(tmp_path, monkeypatch):
 def test_bytes_inside_a_pickle_are_not_unpickled_freely_either(tmp_path):
     inner = pickled(Imports(os.system, f"touch {tmp_path}/harm"))
     thing = Imports(torch.storage._load_from_bytes, inner)
-    with pytest.raises(UserError, match="holds no DAPG policy"):
+    with pytest.raises(UserError, match="does not contain a DAPG policy"):
         DAPGWeights.read(write(tmp_path / "door.pickle", pickled(thing)))
     assert not (tmp_path / "harm").exists()
 
@@ -201,7 +201,7 @@ def test_bytes_inside_a_pickle_are_not_unpickled_freely_either(tmp_path):
 def test_a_truncated_pickle(pickler, share, mjrl, weights, tmp_path):
     content = pickled(policy(mjrl, weights), pickler)
     path = write(tmp_path / "door.pickle", content[: int(share * len(content))])
-    with pytest.raises(UserError, match=rf"^'{path}' holds no DAPG policy: .+$"):
+    with pytest.raises(UserError, match=rf"^'{path}' does not contain a DAPG policy: .+$"):
         DAPGWeights.read(path)
 
 
@@ -216,22 +216,22 @@ def test_a_tensor_larger_than_its_storage(tmp_path):
         DAPGWeights.read(write(tmp_path / "door.pickle", pickled(thing)))
 
 
-def test_arrays_that_are_no_policy(npz, weights, tmp_path):
+def test_arrays_without_a_policy(npz, weights, tmp_path):
     with pytest.raises(UserError, match=r"Cannot read the expert's weights: .*No such file.*none\.npz"):
         DAPGWeights.read(tmp_path / "none.npz")
-    with pytest.raises(UserError, match="holds no DAPG policy"):
+    with pytest.raises(UserError, match="does not contain a DAPG policy"):
         DAPGWeights.read(write(tmp_path / "cut.npz", npz.read_bytes()[:-300]))
     np.savez(tmp_path / "half.npz", W0=weights.W0)
-    with pytest.raises(UserError, match=r"holds no DAPG policy: .*b0"):
+    with pytest.raises(UserError, match=r"does not contain a DAPG policy: .*b0"):
         DAPGWeights.read(tmp_path / "half.npz")
     np.savez(tmp_path / "wrong.npz", **weights._replace(b1=weights.b1[:-1])._asdict())
-    with pytest.raises(UserError, match=r"holds no DAPG policy: W1 must have shape \(3, 5\), got \(4, 5\)"):
+    with pytest.raises(UserError, match=r"does not contain a DAPG policy: W1 must have shape \(3, 5\), got \(4, 5\)"):
         DAPGWeights.read(tmp_path / "wrong.npz")
     np.savez(tmp_path / "nan.npz", **weights._replace(b1=weights.b1 * np.nan)._asdict())
-    with pytest.raises(UserError, match="holds no DAPG policy: b1 must be finite"):
+    with pytest.raises(UserError, match="does not contain a DAPG policy: b1 must be finite"):
         DAPGWeights.read(tmp_path / "nan.npz")
     np.savez(tmp_path / "object.npz", **{**weights._asdict(), "b1": np.array([{}])})
-    with pytest.raises(UserError, match=r"holds no DAPG policy: .*allow_pickle=False"):
+    with pytest.raises(UserError, match=r"does not contain a DAPG policy: .*allow_pickle=False"):
         DAPGWeights.read(tmp_path / "object.npz")
 
 

@@ -1,4 +1,4 @@
-"""Who demonstrates Adroit's tasks: trained policies, or the episodes of a Minari dataset."""
+"""Demonstrators of Adroit's tasks: trained policies, or the episodes of a Minari dataset."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -30,7 +30,7 @@ def attempts(task: str, source: str | None, first_seed: int) -> Iterator[Attempt
         first_seed: of the episodes; those of a dataset bring their own start.
 
     Raises:
-        UserError: if there is no source, or it is none for this task.
+        UserError: if no source is given, or it does not fit this task.
     """
     if not source:
         raise UserError(f"Adroit has no expert built in. Give one with --expert=...: {HOW_TO_GET_ONE}.")
@@ -47,7 +47,7 @@ def replays(task: str, dataset_id: str) -> Iterator[Attempt]:
     """The episodes of a Minari dataset of a task, downloaded if need be: its starts and its actions.
 
     Raises:
-        UserError: if there is no such dataset, or it is one of another task.
+        UserError: if the dataset is missing, or holds another task.
     """
     dataset = _load(dataset_id)
     simulator = make_simulator(task)
@@ -55,7 +55,7 @@ def replays(task: str, dataset_id: str) -> Iterator[Attempt]:
         got, needed = getattr(dataset, name).shape, getattr(simulator, name).shape
         if got != needed:
             raise UserError(
-                f"Minari dataset '{dataset_id}' is none of {task}: its {name} has shape {got}, {task} has {needed}."
+                f"Minari dataset '{dataset_id}' does not fit {task}: its {name} has shape {got}, {task} needs {needed}."
             )
     return (_replay(dataset, dataset_id, index) for index in map(int, dataset.episode_indices))
 
@@ -69,7 +69,9 @@ def _load(dataset_id: str) -> Any:
         return minari.load_dataset(dataset_id, download=True)
     except Exception as error:  # of almost any kind: its remotes raise what their HTTP libraries do
         reason = " ".join(str(error).split())
-        raise UserError(f"There is no Minari dataset '{dataset_id}' here, nor could it be fetched: {reason}") from error
+        raise UserError(
+            f"Minari dataset '{dataset_id}' is not on this computer and could not be downloaded: {reason}"
+        ) from error
 
 
 def _replay(dataset: Any, dataset_id: str, index: int) -> Attempt:
@@ -79,7 +81,7 @@ def _replay(dataset: Any, dataset_id: str, index: int) -> Attempt:
     start = {name: metadata[name] for name in ("seed", "options") if metadata.get(name) is not None}
     name = f"episode {index} of Minari dataset '{dataset_id}'"
     if not start:
-        raise UserError(f"Cannot replay {name}: it says neither with which seed nor in which state it started.")
+        raise UserError(f"Cannot replay {name}: it records neither its seed nor its initial state.")
     return Attempt(start, partial(Replay, name, episode.observations[0], episode.actions))
 
 
@@ -104,7 +106,9 @@ class Replay:
     def __call__(self, env: AdroitPointCloudEnv) -> NDArray[np.float32]:
         """The next action."""
         if self._n_steps == 0 and not np.allclose(env.expert_observation, self._observation, atol=1e-3):
-            raise UserError(f"Cannot replay {self._name}: {env.task} starts in another state than it has recorded.")
+            raise UserError(
+                f"Cannot replay {self._name}: {env.task} starts in a state that differs from the recorded one."
+            )
         action = self._actions[min(self._n_steps, len(self._actions) - 1)]
         self._n_steps += 1
         return env.from_own(action)

@@ -45,7 +45,7 @@ class DAPGWeights(NamedTuple):
         """From an `.npz` file with these names, or from an original pickle.
 
         Raises:
-            UserError: if the file is not there or holds no such policy.
+            UserError: if the file is missing or does not contain a DAPG policy.
         """
         try:
             if path.exists() and not path.is_file():
@@ -62,7 +62,7 @@ class DAPGWeights(NamedTuple):
             raise
         except DAMAGE as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise UserError(f"'{path}' holds no DAPG policy: {reason}") from error
+            raise UserError(f"'{path}' does not contain a DAPG policy: {reason}") from error
         weights._check(path)
         return weights
 
@@ -72,9 +72,11 @@ class DAPGWeights(NamedTuple):
         shapes = (*layers, (n_in,), (n_in,), (n_out,), (n_out,))
         for name, array, shape in zip(self._fields, self, shapes, strict=True):
             if array.shape != shape:
-                raise UserError(f"'{path}' holds no DAPG policy: {name} must have shape {shape}, got {array.shape}.")
+                raise UserError(
+                    f"'{path}' does not contain a DAPG policy: {name} must have shape {shape}, got {array.shape}."
+                )
             if not np.all(np.isfinite(array)):
-                raise UserError(f"'{path}' holds no DAPG policy: {name} must be finite.")
+                raise UserError(f"'{path}' does not contain a DAPG policy: {name} must be finite.")
 
     def check_task(self, task: str, path: Path) -> None:
         """Raise a `UserError` unless the policy fits a task."""
@@ -83,7 +85,7 @@ class DAPGWeights(NamedTuple):
         got = (len(self.in_shift), len(self.out_shift))
         if got != fits:
             raise UserError(
-                f"'{path}' is no expert of {task}: it maps {got[0]} observations to {got[1]} actions, "
+                f"'{path}' does not fit {task}: it maps {got[0]} observations to {got[1]} actions, "
                 f"{task} has {fits[0]} and {fits[1]}."
             )
 

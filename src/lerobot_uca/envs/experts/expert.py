@@ -1,4 +1,4 @@
-"""What a demonstrator is, and how its episodes start."""
+"""Demonstrators, and the starts of their episodes."""
 
 from collections.abc import Callable, Iterator
 from itertools import count
