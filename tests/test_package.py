@@ -2,6 +2,7 @@
 
 import ast
 import importlib.metadata
+import re
 import subprocess
 import sys
 import zipfile
@@ -77,14 +78,29 @@ def test_only_our_console_commands_are_installed():
     }
 
 
-def test_a_wheel_holds_the_package_and_nothing_else(tmp_path):
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> zipfile.ZipFile:
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     subprocess.run(build, check=True, capture_output=True, cwd=SOURCE.parent.parent)
-    (wheel,) = tmp_path.glob("*.whl")
-    names = [name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name]
+    (path,) = folder.glob("*.whl")
+    return zipfile.ZipFile(path)
+
+
+def test_a_wheel_holds_the_package_and_nothing_else(wheel):
+    names = [name for name in wheel.namelist() if ".dist-info/" not in name]
     assert {name.split("/")[0] for name in names} == {"lerobot_uca", "lerobot_policy_uca_flow.py"}
     assert len(names) == sum(len(list(SOURCE.rglob(kind))) for kind in ("*.py", "*.yaml")) + 1
     assert {"lerobot_uca/configs/uca_flow_small.yaml", "lerobot_uca/configs/uca_flow_paper.yaml"} <= set(names)
+
+
+def test_the_wheels_readme_has_no_links_into_the_repository(wheel):
+    (metadata,) = (name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
+    text = wheel.read(metadata).decode()
+    assert "(https://arxiv.org/abs/2403.03954)" in text
+    assert not re.findall(r"\]\((?!https?://)", text)
+    assert "docs/README.md" not in text
+    assert "meanflow.py" in text
 
 
 def test_lerobot_discovers_everything_in_a_fresh_interpreter():
