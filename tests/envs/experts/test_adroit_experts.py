@@ -125,7 +125,9 @@ def test_a_missing_dataset(dataset_id, tmp_path, monkeypatch):
 @pytest.mark.usefixtures("datasets")
 def test_an_episode_without_its_start():
     tries = attempts("door", "minari:local/door/nothing-v0", first_seed=0)
-    with pytest.raises(UserError, match="Cannot replay episode 0 of Minari dataset 'local/door/nothing-v0': it says"):
+    with pytest.raises(
+        UserError, match="Cannot replay episode 0 of Minari dataset 'local/door/nothing-v0': it records"
+    ):
         next(tries)
 
 
