@@ -225,14 +225,17 @@ while arm.state():
 """
 
 
-@pytest.mark.parametrize("victim", ["driver", "client"])
+KILLS = {"driver": signal.SIGKILL, "client": signal.SIGKILL, "driver by Ctrl-C": signal.SIGINT}
+
+
+@pytest.mark.parametrize("victim", KILLS)
 def test_a_killed_process_leaves_the_arm_standing_still(controller, tmp_path, victim):
     program = [sys.executable, "-c", PARENT, controller.address]
     with (tmp_path / "errors").open("w") as errors:
         parent = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=errors, text=True, start_new_session=True)
     client = int(parent.stdout.readline())
     wait_until(lambda: speed(controller) > 0.1)
-    os.kill(parent.pid if victim == "driver" else client, signal.SIGKILL)
+    os.kill(client if victim == "client" else parent.pid, KILLS[victim])
     wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
     wait_until(lambda: stands_still(controller))
     assert not controller.robot.stop_reason

@@ -56,8 +56,8 @@ def write_calibration(folder: Path, name: str, width: int, height: int) -> Path:
     return Calibration(camera, serial=SERIAL, method="the simulated scene's own", residual={"mm": 0.0}).write(folder)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Serve until Ctrl-C."""
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command's options."""
     parser = argparse.ArgumentParser(prog="lerobot-uca-ur5e-sim", description=__doc__)
     parser.add_argument("--ip", default="127.0.0.1", help="loopback address to serve; one for each world [%(default)s]")
     parser.add_argument("--task", choices=TASKS, default="pick_place", help="which things are where [%(default)s]")
@@ -74,7 +74,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--camera", default="top", help="its name in the robot's configuration [%(default)s]")
     parser.add_argument("--width", type=int, default=160, help="of the calibrated image [pixels] [%(default)s]")
     parser.add_argument("--height", type=int, default=120, help="of the calibrated image [pixels] [%(default)s]")
-    options = parser.parse_args(arguments)
+    return parser.parse_args(arguments)
+
+
+def main() -> None:
+    """Serve until Ctrl-C."""
+    options = parse()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if options.calibration is not None:
         file = write_calibration(options.calibration, options.camera, options.width, options.height)
