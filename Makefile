@@ -1,4 +1,5 @@
 # make quickstart   demonstrations, training and evaluation of a real Meta-World task, about 4 minutes on two cores
+# make ur5e-demo    a simulated UR5e recorded, trained, rolled out and replayed
 # make test         the tests
 # make check        style, types, formatting
 
@@ -6,10 +7,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: quickstart test check format
+.PHONY: quickstart ur5e-demo test check format
 
 quickstart: $(INSTALLED)
 	$(BIN)/python examples/quickstart.py
+
+ur5e-demo: $(INSTALLED)
+	$(BIN)/python examples/ur5e_demo.py
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest
