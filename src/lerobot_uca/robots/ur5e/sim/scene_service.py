@@ -71,6 +71,7 @@ class SceneService:
         self._data = mujoco.MjData(scene.model)
         self._cameras: dict[tuple[int, int], tuple[DepthCamera, PictureCamera]] = {}
         self._camera_fault = ""
+        self._frame(160, 120, colour=False)  # the first frame takes longest
 
     def serve(self, connection: socket.socket) -> None:
         """One client."""

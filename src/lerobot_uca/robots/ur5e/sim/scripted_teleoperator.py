@@ -36,7 +36,8 @@ class ScriptedTeleoperator(Teleoperator):
         self.config = config
         self._clock = clock
         self._client: SceneClient | None = None
-        self._episode = -1
+        self._episode = 0
+        self._prepared: Array | None = None
         self._is_demonstrating = False
         self._began = -np.inf
         self._n_sent = 0
@@ -63,6 +64,7 @@ class ScriptedTeleoperator(Teleoperator):
         """Look at the simulated world."""
         del calibrate
         self._client = SceneClient(self.config.ip)
+        self._prepared = self._prepare()
 
     @property
     def is_calibrated(self) -> bool:
@@ -82,25 +84,34 @@ class ScriptedTeleoperator(Teleoperator):
         lasts = config.episode_time_s if self._is_demonstrating else config.reset_time_s
         if now - self._began > lasts - 0.5 / config.fps:
             self._begin_reset() if self._is_demonstrating else self._begin_demonstration()
-            self._began = self._clock()  # planning takes its time
-            self._n_sent = 0
+            self._began, self._n_sent = now, 0
         # A row for each call, not for each moment: a computer that falls behind makes the motion slower, never jerky.
         row = self._last = self._path[min(self._n_sent, len(self._path) - 1)]
         self._n_sent += 1
+        if not self._is_demonstrating and self._n_sent == len(self._path):
+            self._prepared = (
+                self._prepare()
+            )  # at home, where it is in no thing's way; not in the episode, which would begin late
         return dict(zip((*JOINT_KEYS, GRIPPER_KEY), row.tolist(), strict=True))
 
-    def _begin_demonstration(self) -> None:
+    def _prepare(self) -> Array:
+        """Put the things where the next episode begins, and plan it."""
         assert self._client is not None
-        self._is_demonstrating = True
+        config = self.config
+        objects = self._client.ask(request="reset", task=config.task, seed=config.seed + self._episode)
         self._episode += 1
-        objects = self._client.ask(request="reset", task=self.config.task, seed=self.config.seed + self._episode)
-        self._path = plan(self.config.task, objects, self.config.fps)
-        longest = self.config.episode_time_s
-        if len(self._path) > longest * self.config.fps:
+        path = plan(config.task, objects, config.fps)
+        if len(path) > config.episode_time_s * config.fps:
             raise UserError(
-                f"The demonstration takes {len(self._path) / self.config.fps:.1f} s: episode_time_s has to be longer, "
-                f"got {longest}."
+                f"The demonstration takes {len(path) / config.fps:.1f} s: episode_time_s has to be longer, "
+                f"got {config.episode_time_s}."
             )
+        return path
+
+    def _begin_demonstration(self) -> None:
+        # Not prepared: the reset was too short for the way home.
+        self._path = self._prepare() if self._prepared is None else self._prepared
+        self._is_demonstrating, self._prepared = True, None
 
     def _begin_reset(self) -> None:
         self._is_demonstrating = False
