@@ -7,11 +7,11 @@ way, which computes all points before it crops them and samples them all.
 """
 
 import argparse
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from common import print_provenance, times
 from scipy.spatial import cKDTree
 
 from lerobot_uca.point_clouds.depth import CANDIDATES_PER_POINT, DepthToCloud, DepthView, to_millimetres
@@ -30,6 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=50)
     repeats = parser.parse_args().repeats
+    print_provenance()
     image = table()
     stages = ("crop, points", "sample", "all", "plain way", "x", "gap / plain gap")
     print(f"{'ms, median':28}" + "".join(f"{stage:>16}" for stage in stages) + f"{'pixels':>10}")
@@ -56,10 +57,10 @@ def measure(image: np.ndarray, crop: Crop, n_points: int, repeats: int) -> tuple
     n_candidates = CANDIDATES_PER_POINT * n_points
     points = make.points([image], n_candidates)
     every = make.points([image])
-    select = timed(lambda: make.points([image], n_candidates), repeats)
-    sample = timed(lambda: sample_farthest(points, n_points), repeats)
-    whole = timed(lambda: make([image]), repeats)
-    plain = timed(lambda: plain_way(image, crop, n_points), max(3, repeats // 10))
+    select = typical(lambda: make.points([image], n_candidates), repeats)
+    sample = typical(lambda: sample_farthest(points, n_points), repeats)
+    whole = typical(lambda: make([image]), repeats)
+    plain = typical(lambda: plain_way(image, crop, n_points), max(3, repeats // 10))
     ratio = gap(every, make([image])) / gap(every, plain_way(image, crop, n_points))
     return [select, sample, whole, plain, plain / whole, ratio], len(every)
 
@@ -71,18 +72,13 @@ def plain_way(image: np.ndarray, crop: Crop, n_points: int) -> np.ndarray:
 
 
 def gap(scene: np.ndarray, cloud: np.ndarray) -> float:
-    """How far a point of the scene may be from the cloud [m]."""
+    """The largest distance of a point of the scene from the cloud [m]."""
     return float(cKDTree(cloud).query(scene)[0].max())
 
 
-def timed(function: Callable[[], Any], repeats: int) -> float:
+def typical(function: Callable[[], Any], repeats: int) -> float:
     """Median milliseconds of a call."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(1e3 * (time.perf_counter() - start))
-    return float(np.median(times))
+    return float(np.median(times(function, repeats, n_warm_up=1)))
 
 
 if __name__ == "__main__":

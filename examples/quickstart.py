@@ -38,7 +38,7 @@ STEPS = (
         DATASET / "meta" / "info.json",
     ),
     Step(
-        f"lerobot-train --config_path=configs/uca_flow_small.yaml --dataset.repo_id=local/{TASK} "
+        f"lerobot-train --config_path=uca_flow_small --dataset.repo_id=local/{TASK} "
         f"--dataset.root={DATASET} --output_dir={TRAINING}",
         "about 70 seconds",
         TRAINING,
