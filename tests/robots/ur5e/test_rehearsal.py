@@ -1,5 +1,6 @@
 """The whole way with LeRobot's own commands against the simulated arm, which runs as a user starts it."""
 
+import dataclasses
 import subprocess
 import sys
 import threading
@@ -113,6 +114,26 @@ def test_the_calibration_is_the_cameras(world):
     calibration = read_calibrations(folder)["top"]
     assert calibration.camera == simulated_camera(160, 120)
     assert calibration.serial == "simulated"
+
+
+OTHERS = {
+    "device": ({"serial": "123456"}, "is the device simulated, its calibration is of 123456"),
+    "size": ({"camera": simulated_camera(640, 480)}, "images of 160 x 120, its calibration is for 640 x 480"),
+}
+
+
+@pytest.mark.parametrize(("change", "message"), OTHERS.values(), ids=OTHERS)
+def test_the_calibration_of_another_camera_is_refused(world, tmp_path, monkeypatch, change, message):
+    address, folder = world
+    dataclasses.replace(read_calibrations(folder)["top"], **change).write(tmp_path / "other")
+    robot = UR5eFollower(robot_config(address, tmp_path, top=SimulatedCameraConfig(ip=address)))
+    monkeypatch.setenv("LEROBOT_UCA_CALIBRATION", str(folder))
+    with robot:
+        pass
+    monkeypatch.setenv("LEROBOT_UCA_CALIBRATION", str(tmp_path / "other"))
+    with pytest.raises(UserError, match=message):
+        robot.connect()
+    assert not robot.is_connected
 
 
 @pytest.mark.parametrize("fault", ["dead_camera", "stale_frames"])

@@ -10,7 +10,7 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 from numpy.typing import NDArray
 
 from lerobot_uca.robots.ur5e.sim.config_simulated_camera import SimulatedCameraConfig
-from lerobot_uca.robots.ur5e.sim.scene_service import SceneClient
+from lerobot_uca.robots.ur5e.sim.scene_service import SERIAL, SceneClient
 
 FIRST_FRAME = 10.0  # [s]
 
@@ -31,6 +31,7 @@ class SimulatedCamera(Camera):
         super().__init__(config)
         self.config = config
         self.use_rgb, self.use_depth = config.use_rgb, config.use_depth
+        self.serial_number = SERIAL
         self._client: SceneClient | None = None
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
