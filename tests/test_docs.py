@@ -26,6 +26,7 @@ NOT_RUN = {
     "pip install": "installs",
     "python benchmarks/learning.py": "collects, trains and evaluates for minutes, by the commands that are run here",
     "python benchmarks/comparison.py --expert": "trains for three hours",
+    "accelerate launch": "tests/policies/test_distributed.py runs it, in two processes",
 }
 """Beginnings of commands that cannot run here, and why."""
 ELSEWHERE = {
