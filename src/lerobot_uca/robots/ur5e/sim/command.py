@@ -11,7 +11,7 @@ from typing import Self
 from lerobot_uca.point_clouds.calibration import Calibration
 from lerobot_uca.robots.ur5e.sim.controller import Controller
 from lerobot_uca.robots.ur5e.sim.scene import TASKS, TOOL_LENGTH, Scene
-from lerobot_uca.robots.ur5e.sim.scene_service import PORT, SERIAL, Noise, SceneService, simulated_camera
+from lerobot_uca.robots.ur5e.sim.scene_service import FAULTS, PORT, SERIAL, Noise, SceneService, simulated_camera
 from lerobot_uca.robots.ur5e.sim.servers import Server
 
 logger = logging.getLogger(__name__)
@@ -64,11 +64,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of the things' places [%(default)s]")
     parser.add_argument("--noise", type=float, default=0.0, help="of depth at a distance of 1 m [m] [%(default)s]")
     parser.add_argument("--holes", type=float, default=0.0, help="share of pixels without depth [%(default)s]")
-    parser.add_argument(
-        "--fault",
-        help="what breaks: protective_stop, emergency_stop, silent_rtde, gone, latency, "
-        "dropped_packets, stale_frames or dead_camera",
-    )
+    parser.add_argument("--fault", choices=FAULTS, default="none", help="what breaks [%(default)s]")
     parser.add_argument("--after", type=float, default=5.0, help="seconds until it breaks [%(default)s]")
     parser.add_argument("--calibration", type=Path, help="folder to write the camera's calibration to")
     parser.add_argument("--camera", default="top", help="its name in the robot's configuration [%(default)s]")
@@ -91,7 +87,7 @@ def main() -> None:
             options.ip,
             options.ip,
         )
-        if options.fault:
+        if options.fault != "none":
             threading.Timer(options.after, world.service.fault, [options.fault]).start()
         try:
             threading.Event().wait()

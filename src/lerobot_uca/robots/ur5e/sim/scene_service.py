@@ -27,6 +27,10 @@ PORT = 30010
 POSITION, LOOKS_AT = np.array([-0.95, 0.0, 0.85]), np.array([-0.47, 0.0, 0.0])  # [m]
 FIELD_OF_VIEW = math.radians(69)  # horizontal, a D435's colour camera
 SERIAL = "simulated"
+FAULTS = (
+    *("protective_stop", "emergency_stop", "silent_rtde", "gone", "latency", "dropped_packets"),
+    *("stale_frames", "dead_camera", "none"),
+)
 
 
 def simulated_camera(width: int, height: int, name: str = "top") -> Camera:
@@ -120,7 +124,9 @@ class SceneService:
             return {"time": self._data.time, "serial": SERIAL}, images
 
     def fault(self, name: str) -> None:
-        """Break something. The arm's faults last until the controller starts anew."""
+        """Break something. The arm's faults last until the controller starts anew; `none` mends the camera."""
+        if name not in FAULTS:
+            raise UserError(f"A fault is one of {', '.join(FAULTS)}, got '{name}'.")
         network, robot = self._controller.network, self._controller.robot
         faults = {
             "protective_stop": lambda: robot.protective_stop("injected"),
@@ -133,8 +139,6 @@ class SceneService:
             "dead_camera": lambda: setattr(self, "_camera_fault", name),
             "none": lambda: setattr(self, "_camera_fault", ""),
         }
-        if name not in faults:
-            raise UserError(f"A fault is one of {', '.join(faults)}, got '{name}'.")
         with self._lock:
             faults[name]()
 
