@@ -1,8 +1,10 @@
 """The changes that this package makes in LeRobot, and their limits."""
 
+import ast
 import json
 import logging
 import os
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
@@ -138,7 +140,25 @@ def test_another_lerobot_is_left_alone():
         "from lerobot.datasets import factory\n"
         "print(factory.LeRobotDataset.__name__)"
     )
-    assert run(code).stdout.strip() == "LeRobotDataset"
+    result = run(code)
+    assert result.stdout.strip() == "LeRobotDataset"
+    assert "LeRobot 0.7.0 is too new: this package is made for 0.6.1." in result.stderr
+
+
+@pytest.mark.parametrize("name", lerobot_patches.USED_NAMES)
+def test_lerobot_has_what_is_used_of_it(name):
+    """A port to another LeRobot: this says which one is gone."""
+    assert callable(pkgutil.resolve_name(name))
+
+
+def test_every_private_name_is_listed():
+    """Of what is imported from LeRobot; methods are called on its objects by their names."""
+    listed = set(lerobot_patches.USED_NAMES)
+    for path in Path(lerobot_patches.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "lerobot":
+                private = {f"{node.module}.{alias.name}" for alias in node.names if alias.name.startswith("_")}
+                assert private <= listed, path
 
 
 def test_installing_twice_changes_nothing():

@@ -23,6 +23,7 @@ from lerobot.datasets import factory
 from lerobot.policies import factory as policy_factory
 from lerobot.processor import DataProcessorPipeline
 from lerobot.utils import utils
+from packaging.version import Version
 
 from lerobot_uca import configs
 from lerobot_uca.checkpoints.resuming import cycle_exactly, without_trace
@@ -36,6 +37,26 @@ from lerobot_uca.policies.publishing import Evaluation, PublishedPolicy
 from lerobot_uca.processes import end_by_signals
 
 SUPPORTED_LEROBOT = "0.6.1"
+
+USED_NAMES = (
+    # Private names and functions without a promise, by module: a port to another LeRobot starts here.
+    *("lerobot.common.train_utils.save_checkpoint", "lerobot.common.train_utils.update_last_checkpoint"),
+    *("lerobot.common.train_utils.load_training_state", "lerobot.common.train_utils.push_checkpoint_to_hub"),
+    *("lerobot.configs.parser.parse_arg", "lerobot.configs.policies.PreTrainedConfig.from_pretrained"),
+    *(
+        "lerobot.configs.train.TrainPipelineConfig.validate",
+        "lerobot.configs.train.TrainPipelineConfig.from_pretrained",
+    ),
+    *("lerobot.configs.eval.EvalPipelineConfig.__post_init__", "lerobot.datasets.factory.LeRobotDataset"),
+    *("lerobot.datasets.factory.make_dataset", "lerobot.datasets.sampler.EpisodeAwareSampler.state_dict"),
+    *("lerobot.datasets.lerobot_dataset.LeRobotDataset._ensure_reader", "lerobot.envs.utils._LazyAsyncVectorEnv"),
+    *("lerobot.datasets.dataset_reader.DatasetReader.load_and_activate", "lerobot.envs.utils.freeze_after_episode_end"),
+    *("lerobot.policies.factory.make_pre_post_processors", "lerobot.utils.random_utils.get_rng_state"),
+    *("lerobot.policies.pretrained.PreTrainedPolicy._load_as_safetensor", "lerobot.utils.random_utils.set_rng_state"),
+    *("lerobot.policies.pretrained.PreTrainedPolicy.push_model_to_hub",),
+    *("lerobot.processor.pipeline.DataProcessorPipeline._build_steps_from_config",),
+    *("lerobot.processor.pipeline.DataProcessorPipeline.push_to_hub", "lerobot.scripts.lerobot_eval.eval_policy_all"),
+)
 SWITCH = "LEROBOT_UCA_BATCHED_READING"
 
 logger = logging.getLogger(__name__)
@@ -50,9 +71,11 @@ def install() -> None:
     make_registered_steps_only()
     if lerobot.__version__ != SUPPORTED_LEROBOT:
         logger.warning(
-            "This package is made for LeRobot %s; this is %s. Checkpoints are not written whole, resuming does not "
-            "repeat an unbroken run and reading is slow. pip install lerobot==%s",
-            *(SUPPORTED_LEROBOT, lerobot.__version__, SUPPORTED_LEROBOT),
+            "LeRobot %s is too %s: this package is made for %s. Checkpoints are not written whole, resuming does not "
+            "repeat an unbroken run, and reading is slow. To mend it: pip install lerobot==%s",
+            lerobot.__version__,
+            "old" if Version(lerobot.__version__) < Version(SUPPORTED_LEROBOT) else "new",
+            *(SUPPORTED_LEROBOT, SUPPORTED_LEROBOT),
         )
         return
     check_settings()
@@ -285,7 +308,10 @@ def read_in_batches() -> None:
 
     @functools.wraps(make_dataset)
     def make_and_settle(config: TrainPipelineConfig) -> Any:
-        dataset = make_dataset(config)
+        if not isinstance(config.policy, PointCloudPolicyConfig):
+            return make_dataset(config)
+        with reported(f"Dataset '{config.dataset.repo_id}' cannot be read"):
+            dataset = make_dataset(config)
         _read_without_workers(config, dataset)
         return dataset
 
@@ -298,8 +324,7 @@ def _read_without_workers(config: TrainPipelineConfig, dataset: Any) -> None:
     Batched reading takes less time than handing a batch from one process to another, and LeRobot's four workers
     each import everything anew: half a minute on two cores, which they then share with the training.
     """
-    is_ours = isinstance(config.policy, PointCloudPolicyConfig)
-    if is_ours and isinstance(dataset, BatchedDataset) and dataset.is_batched and config.num_workers:
+    if isinstance(dataset, BatchedDataset) and dataset.is_batched and config.num_workers:
         if _is_given("num_workers"):
             return
         logger.info("Batched reading needs no workers: num_workers is 0. --num_workers=N asks for some.")

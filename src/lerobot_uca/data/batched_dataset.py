@@ -16,6 +16,8 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
+from lerobot_uca.errors import reported
+
 MAX_BYTES = 4 * 2**30
 """Datasets whose decoded columns would be larger are read as before."""
 
@@ -110,8 +112,9 @@ class BatchedDataset(LeRobotDataset):
         if not self.is_batched:
             return None
         reader = self._ensure_reader()
-        if reader.hf_dataset is None:
-            reader.load_and_activate()
-        if self._decoded is None or self._decoded.source is not reader.hf_dataset:
-            self._decoded = Columns(reader)
+        with reported(f"Dataset '{self.repo_id}' cannot be read"):
+            if reader.hf_dataset is None:
+                reader.load_and_activate()
+            if self._decoded is None or self._decoded.source is not reader.hf_dataset:
+                self._decoded = Columns(reader)
         return self._decoded
