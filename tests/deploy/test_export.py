@@ -151,9 +151,11 @@ def test_a_processor_step_that_a_trace_would_not_hold_for(tmp_path):
     save(tmp_path)
     path = tmp_path / "policy_preprocessor.json"
     pipeline = json.loads(path.read_text())
-    pipeline["steps"].insert(0, {"registry_name": "time_limit_processor", "config": {"max_episode_steps": 3}})
+    pipeline["steps"].insert(0, {"registry_name": "relative_actions_processor", "config": {}})
     path.write_text(json.dumps(pipeline))
-    with pytest.raises(UserError, match="cannot be exported with its processor step 'time_limit_processor'; these can"):
+    with pytest.raises(
+        UserError, match="cannot be exported with its processor step 'relative_actions_processor'; these can"
+    ):
         export(str(tmp_path), tmp_path / "policy.onnx")
 
 
