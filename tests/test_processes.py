@@ -34,6 +34,18 @@ def test_a_command_ends_in_one_line(number, line):
     assert (process.returncode, out, err.strip()) == (128 + number, "cleaned up\n", line)
 
 
+def test_a_library_that_swallows_the_end_changes_nothing():
+    """Arrow calls Python back, prints what is raised there, and then raises an error of its own."""
+    code = (
+        "import os, signal\n"
+        "from lerobot_uca.processes import end_by_signals; end_by_signals()\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGTERM)\n    signal.pause()\n"
+        "except BaseException:\n    raise ValueError('other') from None"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr.strip()) == (143, "ended by SIGTERM")
+
+
 def test_a_signal_that_is_ignored_stays_ignored():
     code = (
         "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"

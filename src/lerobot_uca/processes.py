@@ -22,8 +22,13 @@ def end_by_signals() -> None:
             signal.signal(number, _end)
 
 
+_received: list[int] = []
+"""The signal that ends this command. A library may swallow the exception, called back from C, and raise another."""
+
+
 def _end(number: int, _: FrameType | None) -> None:
     signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
+    _received.append(number)
     # Not print: the signal may have come while something was being printed.
     os.write(2, f"\nended by {signal.Signals(number).name}\n".encode())
     raise SystemExit(128 + number)
@@ -35,6 +40,8 @@ def _report_interruption() -> None:
         return
 
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+        if _received:
+            raise SystemExit(128 + _received[0])
         if not issubclass(kind, KeyboardInterrupt):
             previous(kind, error, traceback)
             return
