@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import openvino
@@ -237,3 +239,9 @@ def test_a_network_made_in_inference_mode(runtime):
 def test_it_can_be_copied_and_sent(runtime, duplicate):
     network, function, x = make_network(), runtime(call), torch.randn(2, 3)
     assert torch.equal(duplicate(function)(network, x)[0], function(network, x)[0])
+
+
+def test_openvino_reports_to_nobody():
+    """By itself it starts a process that sends usage data over the network."""
+    code = "import sys, lerobot_uca.inference.openvino_function as f; assert sys.modules['openvino_telemetry'] is None"
+    subprocess.run([sys.executable, "-c", code], check=True)
