@@ -24,9 +24,10 @@ NOT_RUN = {
     "make test": "is what runs this",
     "python3.12 -m venv": "installs",
     "pip install": "installs",
-    "python benchmarks/learning.py": "collects, trains and evaluates for minutes, by the commands that are run here",
-    "python benchmarks/comparison.py --expert": "trains for three hours",
     "accelerate launch": "tests/policies/test_distributed.py runs it, in two processes",
+    "lerobot-uca-benchmark run": "trains 37 tasks; tests/protocol/test_run.py runs a tiny one",
+    "lerobot-uca-benchmark report": "needs that run's folder; tests/protocol/test_report.py makes one",
+    "lerobot-uca-benchmark demonstrators": "runs 1850 episodes; tests/protocol/test_demonstrators.py runs two",
 }
 """Beginnings of commands that cannot run here, and why."""
 ELSEWHERE = {
@@ -47,7 +48,6 @@ TINY = {
     "lerobot-train": ["--steps=2", "--batch_size=4", "--num_workers=0"],
     "lerobot-eval": ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false", *TINY_CLOUD],
     "lerobot-uca-export": [],
-    "benchmarks/comparison.py": [],
     "benchmarks/control_loop.py": ["--steps=3", "--tasks", "dial-turn"],
     "benchmarks/fit.py": [],
     "benchmarks/inference.py": ["--calls=1", "--batch_sizes", "1", "--computed_by", "eager"],

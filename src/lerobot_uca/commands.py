@@ -47,8 +47,10 @@ def calibrate() -> None:
 def benchmark() -> None:
     """`lerobot-uca-benchmark`."""
     from lerobot_uca.errors import UserError
+    from lerobot_uca.processes import end_by_signals
     from lerobot_uca.protocol.command import main
 
+    end_by_signals()
     try:
         main()
     except UserError as error:
@@ -60,6 +62,20 @@ def ur5e_sim() -> None:
     from lerobot_uca.errors import UserError
     from lerobot_uca.robots.ur5e.sim.command import main
 
+    try:
+        main()
+    except UserError as error:
+        sys.exit(f"error: {error}")
+
+
+def saliency() -> None:
+    """`lerobot-uca-saliency`."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_uca.errors import UserError
+    from lerobot_uca.visual.saliency import main
+
+    register_third_party_plugins()
     try:
         main()
     except UserError as error:

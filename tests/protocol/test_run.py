@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -33,12 +34,13 @@ def benchmark(output: Path, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*command, *options], capture_output=True, text=True, check=False)
 
 
-def make_run(output: Path) -> RunFolder:
+def make_run(output: Path, **changes: object) -> RunFolder:
     """A folder that has its demonstrations; collecting them has tests of its own."""
-    folder = RunFolder.create(output, Setting.from_values("tiny", TINY))
+    values = {**TINY, **changes}
+    folder = RunFolder.create(output, Setting.from_values("tiny", values))
     with folder.demonstrations(GOOD) as dataset:
         write_dataset(dataset)
-    (output / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    (output / "tiny.yaml").write_text(yaml.safe_dump(values))
     return folder
 
 
@@ -119,3 +121,42 @@ def test_another_setting_is_refused(finished):
 def test_adroit_needs_an_expert(tmp_path):
     result = benchmark(tmp_path / "run", "--tasks=adroit/door", "--seeds=0")
     assert result.stderr.startswith("error: Adroit has no expert built in. Give one with --expert=")
+
+
+def start(folder: RunFolder, *options: str) -> subprocess.Popen[bytes]:
+    command = [Path(sys.executable).with_name("lerobot-uca-benchmark"), "run", f"--output={folder.path}"]
+    setting = f"--setting={folder.path}/tiny.yaml"
+    return subprocess.Popen([*command, setting, "--tasks=drawer-close", *options], stdout=subprocess.DEVNULL)
+
+
+def wait_for(condition) -> None:
+    while not condition():
+        time.sleep(0.05)
+
+
+def test_a_run_that_is_killed_goes_on_inside_the_training(tmp_path):
+    folder = make_run(tmp_path, lengths={"metaworld": {"steps": 300, "evaluations": 3}})
+    files = folder.cell(GOOD)
+    killed = start(folder, "--seeds=0")
+    checkpoints = files.training / "checkpoints"
+    wait_for((checkpoints / "last").exists)
+    killed.kill()
+    killed.wait()
+    wait_for(lambda: _is_free(files))  # its training dies with it
+    step = int((checkpoints / "last").resolve().name)
+    assert step < 300
+    assert not files.rows.exists()
+    result = benchmark(folder.path, f"--setting={folder.path}/tiny.yaml", "--tasks=drawer-close", "--seeds=0")
+    assert result.returncode == 0, result.stdout + result.stderr
+    first, second = (line for line in (files.path / "training.log").read_text().splitlines() if line[:1] == "$")
+    assert "--resume" not in first
+    assert "--resume=true" in second
+    assert f"Training:   0%|          | 0/{300 - step}" in (files.path / "training.log").read_text()
+    assert {path.name for path in files.rows.iterdir()} == {
+        *("step_000100.csv", "step_000200.csv", "step_000300.csv", "final.csv")
+    }
+
+
+def _is_free(files) -> bool:
+    with files.claim() as lock:
+        return lock is not None

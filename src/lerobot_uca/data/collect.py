@@ -26,7 +26,7 @@ from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.data.demonstrations import demonstrations
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
-from lerobot_uca.envs.experts.expert import Attempt
+from lerobot_uca.envs.experts.expert import Attempt, smoothed
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO
 from lerobot_uca.hub import uploading
@@ -56,6 +56,9 @@ class CollectConfig:
     # Who demonstrates. Meta-World's experts are built in; Adroit's are files: weights as .npz or as an original DAPG
     # pickle, or a Minari dataset such as minari:D4RL/door/expert-v2. '{task}' stands for each task.
     expert: str | None = None
+    # Weight of the expert's new action against the last one, a first-order filter: 1 for the expert as it is. An expert
+    # that chatters is easier to imitate when it is smoothed, and may even succeed more often (docs/benchmark.md).
+    smoothing: float = 1.0
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)
     # Seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of
@@ -101,7 +104,7 @@ def collect(config: CollectConfig) -> LeRobotDataset:
 def _attempts(config: CollectConfig, env_config: PointCloudEnvConfig) -> dict[str, Iterator[Attempt]]:
     # Groups may overlap; a task's episodes are wanted once.
     tasks = dict.fromkeys(task for tasks in env_config.tasks().values() for task in tasks)
-    return {task: env_config.attempts(task, config.expert, config.seed) for task in tasks}
+    return {task: smoothed(env_config.attempts(task, config.expert, config.seed), config.smoothing) for task in tasks}
 
 
 def _write(

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid
-from lerobot_uca.protocol.launchers import local, n_cores
+from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid, resolve_tasks
+from lerobot_uca.protocol.launchers import Launcher, local, n_cores, on_ray, on_slurm
 from lerobot_uca.protocol.report import report
 from lerobot_uca.protocol.run import make_folder, run
 
@@ -18,7 +18,8 @@ Train and evaluate every policy on every task with every seed, and go on where a
       --expert='experts/{{task}}.npz'
 
 Each (task, policy, seed) is a cell with a folder of its own. Several processes, also on several machines that share
-the disk, may work on one output folder: each takes the cells that nobody else works on. Stop with Ctrl-C.
+the disk, may work on one output folder: each takes the cells that nobody else works on. Stop with Ctrl-C; the same
+command goes on. Every cell has one thread; as many run at once as there are cores.
 
 suites:   {", ".join(SUITES)}
 groups:   {", ".join(PAPER_GROUPS)}
@@ -34,6 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     _add_run(commands)
     _add_report(commands)
+    _add_demonstrators(commands)
     args = parser.parse_args(arguments)
     args.do(args)
 
@@ -54,15 +56,35 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     parser.add_argument("--setting", default="small", help="small, paper, or a YAML file's path (default: small)")
     parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
     parser.add_argument("--parallel", type=int, default=n_cores(), help="cells at once (default: one a core)")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster instead, at HOST:PORT or auto")
+    where.add_argument(
+        "--slurm",
+        nargs="?",
+        const="",
+        metavar="OPTIONS",
+        help="run as a Slurm array instead; sbatch's options as partition=gpu,time=600",
+    )
     parser.set_defaults(do=_run)
 
 
 def _run(args: argparse.Namespace) -> None:
     cells = grid(args.suite, args.tasks, args.policies, args.seeds)
+    if not run(make_folder(args.output, args.setting), cells, _launcher(args), args.expert):
+        sys.exit(1)
+
+
+def _launcher(args: argparse.Namespace) -> Launcher:
+    if args.ray is not None:
+        return on_ray(args.ray)
+    if args.slurm is not None:
+        pairs = [option.partition("=") for option in args.slurm.split(",") if option]
+        if not all(name and value for name, _, value in pairs):
+            raise UserError(f"--slurm takes options as partition=gpu,time=600, got '{args.slurm}'.")
+        return on_slurm({name: value for name, _, value in pairs})
     if args.parallel < 1:
         raise UserError(f"--parallel must be at least 1, got {args.parallel}.")
-    if not run(make_folder(args.output, args.setting), cells, local(args.parallel), args.expert):
-        sys.exit(1)
+    return local(args.parallel)
 
 
 REPORT_HELP = """\
@@ -92,3 +114,39 @@ def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
 def _report(args: argparse.Namespace) -> None:
     print(report(args.runs, args.output, as_html=args.html))
     print(f"Written to {args.output}.", file=sys.stderr)
+
+
+DEMONSTRATORS_HELP = """\
+How often each task's expert succeeds, and how much its actions change from step to step, as a CSV file.
+
+  lerobot-uca-benchmark demonstrators --suite=paper --expert='experts/{task}.npz' --output=demonstrators.csv
+  lerobot-uca-benchmark demonstrators --tasks=pen --expert='experts/{task}.npz' --smoothing=0.3 --output=smooth.csv
+"""
+
+
+def _add_demonstrators(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    parser = commands.add_parser(
+        "demonstrators",
+        help="how well the experts do their tasks",
+        description=DEMONSTRATORS_HELP,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--output", type=Path, required=True, help="CSV file to write")
+    parser.add_argument("--suite", default="paper", help="set of tasks (default: paper)")
+    parser.add_argument("--tasks", help="tasks or groups out of the suite, separated by commas (default: all)")
+    parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
+    parser.add_argument("--smoothing", type=float, default=1.0, help="as for lerobot-uca-collect (default: 1)")
+    parser.add_argument("--episodes", type=int, default=50, help="of each task (default: 50)")
+    parser.set_defaults(do=_demonstrators)
+
+
+def _demonstrators(args: argparse.Namespace) -> None:
+    from lerobot_uca.protocol.demonstrators import demonstrators
+
+    if args.episodes < 1:
+        raise UserError(f"--episodes must be at least 1, got {args.episodes}.")
+    tasks = resolve_tasks(args.suite, args.tasks)
+    options = {"expert": args.expert, "smoothing": args.smoothing, "n_episodes": args.episodes}
+    for row in demonstrators(tasks, args.output, **options):
+        print(f"{row.task}: {row.demonstrations} of {row.episodes} (any success: {row.any_success})")

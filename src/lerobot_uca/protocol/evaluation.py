@@ -2,7 +2,7 @@
 
 Four things save time. No picture is made. Nothing is observed that the policy does not look at: with two observation
 steps and three actions a plan, a third of the clouds. Episodes share the policy's calls, and where one has ended the
-next begins, so that none waits for the longest. Simulators are kept.
+next begins, so that none waits for the longest. Environments are kept.
 
 Each episode draws its noise from a generator of its own, seeded as the episode is: an episode depends on the policy
 and its seed, not on which others ran beside it (rounding apart: a matrix product may add in another order).
@@ -142,7 +142,7 @@ class PolicyPlan:
         self, policy: PointCloudPolicy, preprocess: Callable[..., Any], postprocess: Callable[..., Any]
     ) -> None:
         self.policy, self.config = policy.eval(), policy.config
-        self._preprocess, self._postprocess = preprocess, postprocess
+        self.preprocess, self.postprocess = preprocess, postprocess
 
     @classmethod
     def from_checkpoint(cls, checkpoint: Path) -> Self:
@@ -161,7 +161,7 @@ class PolicyPlan:
         histories = [episode.history() for episode in running]
         noise = [torch.randn(config.horizon, config.n_actions, generator=episode.noise) for episode in running]
         with torch.inference_mode():
-            batch = self._preprocess(
+            batch = self.preprocess(
                 {
                     OBS_POINT_CLOUD: _stack(histories, "point_cloud"),  # (E, O, N, 3)
                     OBS_STATE: _stack(histories, "agent_pos"),  # (E, O, S)
@@ -169,7 +169,7 @@ class PolicyPlan:
             )
             noise_on_device = torch.stack(noise).to(batch[OBS_STATE].device)
             actions = self.policy.predict_action_chunk(batch, noise=noise_on_device)
-            return self._postprocess(actions).to("cpu", torch.float32).numpy()
+            return self.postprocess(actions).to("cpu", torch.float32).numpy()
 
 
 def _stack(histories: list[list[Observation]], key: str) -> Tensor:

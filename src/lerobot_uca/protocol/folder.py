@@ -68,7 +68,7 @@ class RunFolder:
             UserError: if it cannot be written, or was made with another setting.
         """
         file = path / "setting.json"
-        values = json.loads(json.dumps(setting.as_values()))
+        values = setting.as_values()
         try:
             (path / "demonstrations").mkdir(parents=True, exist_ok=True)
             with _locked(path / "lock", fcntl.LOCK_EX):
@@ -76,7 +76,7 @@ class RunFolder:
                     write_json(file, values)
         except OSError as error:
             raise UserError(f"--output '{path}' cannot be written: {error}") from error
-        difference = first_difference(_read_json(file), values)
+        difference = first_difference(cls.open(path).setting.as_values(), values)
         if difference:
             raise UserError(
                 f"'{path}' was made with another setting: {difference}. Choose another --output, or the same --setting."
@@ -131,6 +131,7 @@ class RunFolder:
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write a JSON file, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.unfinished")
     unfinished.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     unfinished.replace(path)

@@ -1,17 +1,28 @@
 """Where cells run. A launcher takes cells and yields how each has ended, as they end."""
 
+import logging
 import os
+import shutil
+import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.folder import RunFolder
 from lerobot_uca.protocol.run_cell import Outcome
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
+
+
+N_RETRIES = 5  # of a cell whose node has died
+MAX_MINUTES = 24 * 60  # of a cell on Slurm, unless the options say another time
+POLL_SECONDS = 0.5
 
 
 class Ended(NamedTuple):
@@ -19,6 +30,8 @@ class Ended(NamedTuple):
 
     cell: Cell
     returncode: int
+    reason: str | None = None
+    """Why the launcher has given it up, if it has."""
 
 
 Launcher = Callable[[Path, Sequence[Cell], str | None], Iterator[Ended]]
@@ -27,30 +40,110 @@ Launcher = Callable[[Path, Sequence[Cell], str | None], Iterator[Ended]]
 
 def run_process(folder: Path, cell: Cell, expert: str | None) -> int:
     """Run a cell in a process of its own, in one thread; its exit code."""
+    return _start(folder, cell, expert).wait()
+
+
+def _start(folder: Path, cell: Cell, expert: str | None) -> "subprocess.Popen[bytes]":
     arguments = [str(folder), cell.task, cell.policy, str(cell.seed), *([expert] if expert else [])]
     command = [sys.executable, "-m", "lerobot_uca.protocol.run_cell", *arguments]
-    return subprocess.run(command, env={**os.environ, **ONE_THREAD}, check=False).returncode  # noqa: S603
+    return subprocess.Popen(command, env={**os.environ, **ONE_THREAD})  # noqa: S603
 
 
 def local(n_parallel: int) -> Launcher:
-    """On this machine, so many cells at once."""
+    """On this machine, so many cells at once. They end when the launcher is left, with Ctrl-C for example."""
 
     def launch(folder: Path, cells: Sequence[Cell], expert: str | None) -> Iterator[Ended]:
-        waiting = iter(cells)
-        running: dict[Future[int], Cell] = {}
-        # The threads only wait for their processes.
-        with ThreadPoolExecutor(n_parallel) as pool:
-            while True:
-                for cell in waiting:
-                    running[pool.submit(run_process, folder, cell, expert)] = cell
-                    if len(running) == n_parallel:
-                        break
-                if not running:
-                    return
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    cell = running.pop(future)
-                    yield Ended(cell, future.result())
+        waiting = deque(cells)
+        running: list[tuple[subprocess.Popen[bytes], Cell]] = []
+        try:
+            while waiting or running:
+                while waiting and len(running) < n_parallel:
+                    cell = waiting.popleft()
+                    running.append((_start(folder, cell, expert), cell))
+                time.sleep(POLL_SECONDS)
+                for process, cell in [each for each in running if each[0].poll() is not None]:
+                    running.remove((process, cell))
+                    yield Ended(cell, process.returncode)
+        finally:
+            for process, _ in running:
+                process.kill()  # and with it its training, which is tied to it
+                process.wait()
+
+    return launch
+
+
+def on_ray(address: str) -> Launcher:
+    """On a Ray cluster whose nodes share the disk. A cell whose node dies is begun anew on another, where it goes on.
+
+    Raises:
+        UserError: if Ray is not installed, or the address does not answer.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise UserError("--ray needs Ray: pip install 'lerobot_policy_uca_flow[ray]'.") from error
+    _connect(ray, address)
+
+    def launch(folder: Path, cells: Sequence[Cell], expert: str | None) -> Iterator[Ended]:
+        needs_gpu = RunFolder.open(folder).setting.policy.get("device") != "cpu" and ray.cluster_resources().get("GPU")
+        remote = ray.remote(num_cpus=1, num_gpus=1 if needs_gpu else 0, max_retries=N_RETRIES)(run_process)
+        running = {remote.remote(folder, cell, expert): cell for cell in cells}
+        while running:
+            (done, *_), _ = ray.wait(list(running))
+            cell = running.pop(done)
+            try:
+                yield Ended(cell, ray.get(done))
+            except ray.exceptions.RayError as error:
+                yield Ended(cell, Outcome.FAILED, f"Ray gave it up: {' '.join(str(error).split())[:300]}")
+        ray.shutdown()
+
+    return launch
+
+
+def _connect(ray: Any, address: str) -> None:
+    host, separator, port = address.removeprefix("ray://").rpartition(":")
+    try:
+        if separator:  # Ray itself would try for minutes
+            socket.create_connection((host, int(port)), timeout=10).close()
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise UserError(
+            f"No Ray cluster answers at --ray='{address}': {error}. It is HOST:PORT of the head node, as "
+            "'ray start --head' prints it, or auto."
+        ) from error
+
+
+def on_slurm(options: Mapping[str, str], cluster: str = "slurm") -> Launcher:
+    """As a Slurm array, one task a cell, through submitit. The nodes share the disk.
+
+    Args:
+        options: of sbatch, by their long names: partition, time, gres, ...
+        cluster: submitit's name of the scheduler; 'local' runs the tasks here.
+
+    Raises:
+        UserError: if submitit or Slurm is not installed.
+    """
+    try:
+        import submitit
+    except ImportError as error:
+        raise UserError("--slurm needs submitit: pip install 'lerobot_policy_uca_flow[slurm]'.") from error
+    if cluster == "slurm" and shutil.which("sbatch") is None:
+        raise UserError("--slurm needs Slurm: there is no command sbatch on this machine.")
+
+    def launch(folder: Path, cells: Sequence[Cell], expert: str | None) -> Iterator[Ended]:
+        executor = submitit.AutoExecutor(folder / "slurm", cluster=cluster)
+        executor.update_parameters(name="lerobot-uca-benchmark", cpus_per_task=1, timeout_min=MAX_MINUTES)
+        executor.update_parameters(slurm_additional_parameters=dict(options))
+        jobs = executor.map_array(run_process, *zip(*((folder, cell, expert) for cell in cells), strict=True))
+        running = dict(zip(jobs, cells, strict=True))
+        while running:
+            for job in [job for job in running if job.done()]:
+                cell = running.pop(job)
+                try:
+                    yield Ended(cell, job.result())
+                except (submitit.core.utils.FailedJobError, submitit.core.utils.UncompletedJobError) as error:
+                    yield Ended(cell, Outcome.FAILED, f"Slurm gave it up: {' '.join(str(error).split())[:300]}")
+            time.sleep(POLL_SECONDS)
 
     return launch
 
@@ -58,6 +151,3 @@ def local(n_parallel: int) -> Launcher:
 def n_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-__all__ = ["Ended", "Launcher", "Outcome", "local", "n_cores", "run_process"]

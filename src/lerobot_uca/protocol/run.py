@@ -31,6 +31,8 @@ def run(folder: RunFolder, cells: Sequence[Cell], launch: Launcher, expert: str 
         )
     missing = [cell for cell in cells if not folder.cell(cell).is_finished]
     folder.log(f"{len(missing)} of {len(cells)} cells to do, setting '{folder.setting.name}'")
+    if not missing:
+        return True
     begin = time.monotonic()
     failed, claimed = [], []
     for n_done, each in enumerate(launch(folder.path, missing, expert), start=1):
@@ -65,6 +67,9 @@ def _describe(folder: RunFolder, each: Ended) -> str:
             return f"{each.cell}: {100 * result['success']:.0f} % of {result['episodes']} fresh episodes ({minutes})"
         case Outcome.CLAIMED:
             return f"{each.cell}: another process works on it"
+        case Outcome.FAILED if each.reason is not None:
+            reason = each.reason
+            write_json(files.failure, {"reason": reason})
         case Outcome.FAILED:
             reason = json.loads(files.failure.read_text(encoding="utf-8"))["reason"]
         case _:  # it could not say so itself

@@ -81,6 +81,7 @@ def _work(folder: RunFolder, cell: Cell, expert: str | None, lock: TextIOWrapper
 
 def _evaluate(folder: RunFolder, cell: Cell, dataset: Path) -> None:
     """Make the rows that are missing. A checkpoint whose rows are there is removed, unless it is the last one."""
+    _load_lerobot()
     files, setting = folder.cell(cell), folder.setting
     length = setting.length(cell)
     files.rows.mkdir(exist_ok=True)
@@ -90,6 +91,16 @@ def _evaluate(folder: RunFolder, cell: Cell, dataset: Path) -> None:
         if done is not None and step < length.steps:
             shutil.rmtree(done.parent)
     _evaluate_checkpoint(folder, cell, dataset, length.steps, is_final=True)
+
+
+def _load_lerobot() -> None:
+    """Not before it is needed: during the training its memory is the training's."""
+    import torch
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    logging.disable(logging.INFO)
+    torch.set_num_threads(1)
 
 
 def _evaluate_checkpoint(folder: RunFolder, cell: Cell, dataset: Path, step: int, *, is_final: bool) -> None:
@@ -181,12 +192,6 @@ def main() -> None:
     """Run the cell that the command line names."""
     tie_to_parent()
     path, task, policy, seed, *expert = sys.argv[1:]
-    import torch
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    register_third_party_plugins()
-    logging.disable(logging.INFO)
-    torch.set_num_threads(1)
     sys.exit(run_cell(RunFolder.open(Path(path)), Cell(task, policy, int(seed)), expert[0] if expert else None))
 
 

@@ -9,7 +9,7 @@ from typing import Any, Self
 import yaml
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.protocol.cells import POLICIES, Cell
+from lerobot_uca.protocol.cells import POLICIES, SUITES, Cell
 
 FOLDER = files("lerobot_uca.protocol") / "settings"
 
@@ -46,6 +46,8 @@ class Setting:
     """By 'benchmark' or 'benchmark/task'; the latter counts where both are there."""
     demonstrations: int = 10
     """Expert episodes of a task."""
+    smoothing: Mapping[str, float] = field(default_factory=dict)
+    """Of experts' actions, by task, as for lerobot-uca-collect."""
     interim_episodes: int = 20
     """Episodes of each evaluation during training."""
     final_episodes: int = 100
@@ -98,6 +100,12 @@ class Setting:
                 raise UserError(
                     f"Setting '{self.name}': steps of {key} must be a multiple of its evaluations, "
                     f"got {length.steps} and {length.evaluations}."
+                )
+        for task, smoothing in self.smoothing.items():
+            if task not in SUITES["all"] or not isinstance(smoothing, int | float) or not 0 < smoothing <= 1:
+                raise UserError(
+                    f"Setting '{self.name}': smoothing holds numbers above 0 and up to 1 by 'benchmark/task', "
+                    f"got {task}: {smoothing!r}."
                 )
         types = {method.type for method in POLICIES.values()}
         for policy_type in self.policies:

@@ -39,6 +39,7 @@ def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
                 "repo_id": repo_id(cell),
                 "root": dataset,
                 "n_episodes": folder.setting.demonstrations,
+                "smoothing": folder.setting.smoothing.get(cell.task, 1.0),
             }
             if expert is not None and cell.benchmark == "adroit":
                 options["expert"] = expert

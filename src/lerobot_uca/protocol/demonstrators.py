@@ -1,0 +1,125 @@
+"""`lerobot-uca-benchmark demonstrators`: how well the experts themselves do their tasks.
+
+Without clouds, which no expert looks at: an episode takes as long as its simulation.
+"""
+
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import islice
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from lerobot.envs.configs import EnvConfig
+from tqdm import tqdm
+
+from lerobot_uca.data.collect import FIRST_SEED
+from lerobot_uca.envs.configs import PointCloudEnvConfig
+from lerobot_uca.envs.experts.expert import Attempt, smoothed
+from lerobot_uca.envs.point_cloud_env import PointCloudEnv
+from lerobot_uca.errors import UserError
+from lerobot_uca.processes import end_with_parent
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.launchers import n_cores
+
+
+class Trial(NamedTuple):
+    """One episode of an expert."""
+
+    n_successful: int
+    """Steps in which the task was successful."""
+    roughness: float
+    """Mean change of an action's numbers from step to step, each in [-1, 1]."""
+
+
+class Demonstrator(NamedTuple):
+    """How an expert does on a task: a row of the table."""
+
+    task: str
+    smoothing: float
+    episodes: int
+    demonstrations: int
+    """Episodes that are kept as demonstrations: with as many successful steps as the benchmark's rule asks for."""
+    any_success: int
+    """Episodes with a successful step."""
+    roughness: float
+    """Of the demonstrations, the median."""
+    first_seed: int
+    mujoco: str
+    """Version."""
+
+
+def demonstrators(
+    tasks: Sequence[str], path: Path, *, expert: str | None, smoothing: float, n_episodes: int
+) -> list[Demonstrator]:
+    """Write a table of experts as CSV, task by task, so that what is there stays when it is stopped.
+
+    Raises:
+        UserError: if there is no expert, or the file cannot be written.
+    """
+    import mujoco
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows: list[Demonstrator] = []
+    for task in tqdm(tasks, desc="Experts", unit="task"):
+        make_env, attempts, needed = _of_task(task, expert, smoothing)
+        trials = list(_trials(make_env, islice(attempts, n_episodes)))
+        kept = [trial for trial in trials if trial.n_successful >= needed]
+        rows.append(
+            Demonstrator(
+                task=task,
+                smoothing=smoothing,
+                episodes=len(trials),
+                demonstrations=len(kept),
+                any_success=sum(trial.n_successful > 0 for trial in trials),
+                roughness=round(float(np.median([trial.roughness for trial in kept])), 4) if kept else float("nan"),
+                first_seed=FIRST_SEED,
+                mujoco=mujoco.__version__,
+            )
+        )
+        _write(path, rows)
+    return rows
+
+
+def try_once(make_env: Callable[[], PointCloudEnv], attempt: Attempt) -> Trial:
+    """Run an expert for a whole episode, also past its first success, as it is demonstrated."""
+    env, expert = make_env(), attempt.expert()
+    env.reset(**attempt.reset)
+    actions, n_successful, is_over = [], 0, False
+    while not is_over:
+        actions.append(expert(env))
+        _, terminated, truncated, info = env.act(actions[-1])
+        n_successful += bool(info["is_success"])
+        is_over = truncated or (terminated and not info["is_success"])
+    env.close()
+    return Trial(n_successful, float(np.abs(np.diff(actions, axis=0)).mean()))
+
+
+def _trials(make_env: Callable[[], PointCloudEnv], attempts: Iterator[Attempt]) -> Iterator[Trial]:
+    with ProcessPoolExecutor(n_cores(), mp_context=get_context("forkserver"), initializer=end_with_parent) as pool:
+        pending = [pool.submit(try_once, make_env, attempt) for attempt in attempts]
+        for future in pending:
+            yield future.result()
+
+
+def _of_task(task: str, expert: str | None, smoothing: float) -> tuple[Any, Iterator[Attempt], int]:
+    cell = Cell(task, "uca_flow", 0)
+    config = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
+    assert isinstance(config, PointCloudEnvConfig)
+    source = expert if cell.benchmark == "adroit" else None
+    attempts = smoothed(config.attempts(cell.env_task, source, FIRST_SEED), smoothing)
+    make_env = config.env_factory(cell.env_task)
+    return make_env, attempts, make_env().min_successful_steps
+
+
+def _write(path: Path, rows: Sequence[Demonstrator]) -> None:
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    try:
+        with unfinished.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerows([Demonstrator._fields, *rows])
+        unfinished.replace(path)
+    except OSError as error:
+        raise UserError(f"--output '{path}' cannot be written: {error}") from error

@@ -1,0 +1,1 @@
+"""Pictures and recordings of what a policy sees and does."""

@@ -1,0 +1,92 @@
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.protocol import run_cell as run_cell_module
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.folder import RunFolder
+from lerobot_uca.protocol.launchers import Ended
+from lerobot_uca.protocol.run import run as run_cells
+from lerobot_uca.protocol.run_cell import Outcome, run_cell
+from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.protocol.training import CellError, NoSpaceError, as_arguments, run
+
+CELL, OTHER = (Cell("metaworld/reach", "uca_flow", seed) for seed in (0, 1))
+
+
+@pytest.fixture
+def folder(tmp_path) -> RunFolder:
+    lengths = {"metaworld": {"steps": 4, "evaluations": 2}}
+    setting = Setting.from_values("tiny", {"description": "-", "batch_size": 8, "lengths": lengths})
+    return RunFolder.create(tmp_path / "run", setting)
+
+
+def run_python(code: str, log: Path) -> None:
+    run("python", ["-c", code], log=log)
+
+
+def test_a_command_that_fails_says_why(tmp_path):
+    with pytest.raises(CellError) as caught:
+        run_python("import sys; print('working'); sys.exit('error: it is too warm')", tmp_path / "log")
+    assert str(caught.value) == f"python ended with exit code 1: it is too warm (see {tmp_path}/log)"
+    assert "working\n" in (tmp_path / "log").read_text()
+
+
+def test_a_command_that_is_killed_for_memory(tmp_path):
+    with pytest.raises(CellError, match="python was killed by SIGKILL, as processes are when the memory is full"):
+        run_python("import os; print('at work', flush=True); os.kill(os.getpid(), 9)", tmp_path / "log")
+
+
+def test_a_command_that_finds_no_space(tmp_path):
+    code = "import errno, os; raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))"
+    with pytest.raises(NoSpaceError, match="python found no space left"):
+        run_python(code, tmp_path / "log")
+
+
+def test_options_are_written_as_draccus_reads_them():
+    options = {"policy.dual_pass": False, "policy.unet_widths": [8, 16], "root": Path("a")}
+    assert as_arguments(options) == [
+        "--policy.dual_pass=false",
+        "--policy.unet_widths=[8, 16]",
+        "--root=a",
+    ]
+
+
+def test_a_cell_without_space_stops_the_run_and_stays_open(folder, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(run_cell_module, "_work", full)
+    assert run_cell(folder, CELL, None) == Outcome.NO_SPACE
+    assert not folder.cell(CELL).failure.exists()
+
+    def launch(path, cells, expert):
+        yield Ended(CELL, Outcome.NO_SPACE)
+        raise AssertionError("the run must stop")
+
+    with pytest.raises(UserError, match=r"No space left for .* start the same command again: it goes on"):
+        run_cells(folder, [CELL, OTHER], launch, None)
+
+
+def test_a_cells_process_that_is_killed_is_recorded_and_the_rest_goes_on(folder, capsys):
+    def launch(path, cells, expert):
+        assert list(cells) == [CELL, OTHER]
+        yield Ended(CELL, -9)
+        yield Ended(OTHER, Outcome.CLAIMED)
+
+    assert not run_cells(folder, [CELL, OTHER], launch, None)
+    assert "its process was killed by SIGKILL, as processes are when the memory is full" in (
+        folder.cell(CELL).failure.read_text()
+    )
+    output = capsys.readouterr().out
+    assert f"[1/2, 0:00 h left] {CELL} FAILED: its process was killed" in output
+    assert "finished: 0, failed: 1, being worked on by another process: 1" in output
+
+
+def test_any_exception_concerns_one_cell(folder, monkeypatch):
+    monkeypatch.setattr(run_cell_module, "_work", lambda *_: 1 / 0)
+    assert run_cell(folder, CELL, None) == Outcome.FAILED
+    assert '"reason": "ZeroDivisionError: division by zero"' in folder.cell(CELL).failure.read_text()

@@ -1,0 +1,79 @@
+import pytest
+import torch
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from lerobot_uca.visual.saliency import main, moments_of, saliency
+
+
+def inputs(policy, batch_size=2):
+    config = policy.config
+    cloud = torch.rand(batch_size, config.n_obs_steps, N_POINTS, 3)
+    return cloud, torch.rand(batch_size, config.n_obs_steps, N_STATES), torch.randn(batch_size, 4, N_ACTIONS)
+
+
+def test_saliency_is_the_gradients_length(policy):
+    """By finite differences in double precision."""
+    policy = policy.double()
+    cloud, state, noise = (each.double() for each in inputs(policy))
+    got = saliency(policy, cloud, state, noise)
+    model = policy.active_model
+
+    def size(points):
+        return policy.generate(model.generator, noise, model.encoder(points, state))[1].square().sum()
+
+    point = int(got[1].argmax())
+    gradient = []
+    for axis in range(3):
+        ahead, behind = cloud.clone(), cloud.clone()
+        ahead[1, -1, point, axis] += 1e-6
+        behind[1, -1, point, axis] -= 1e-6
+        gradient.append((size(ahead) - size(behind)) / 2e-6)
+    assert got[1, point].item() == pytest.approx(torch.stack(gradient).norm().item(), rel=1e-5)
+    assert got.shape == (2, N_POINTS)
+
+
+@pytest.fixture
+def checkpoint(policy, dataset_root, tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.policies.factory import make_pre_post_processors
+
+    folder = tmp_path / "checkpoint"
+    policy.save_pretrained(folder)
+    stats = LeRobotDataset("test/random", root=dataset_root).meta.stats
+    for processor in make_pre_post_processors(policy.config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    return folder
+
+
+def test_a_picture_and_a_recording(checkpoint, dataset_root, tmp_path, capsys):
+    pytest.importorskip("rerun")
+    main([str(checkpoint), str(dataset_root), f"--output={tmp_path}/saliency", "--rerun"])
+    assert (tmp_path / "saliency" / "saliency.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "saliency" / "saliency.rrd").read_bytes().startswith(b"RRF")
+    assert "saliency.png" in capsys.readouterr().out
+
+
+def test_moments_are_in_the_datasets_units(checkpoint, dataset_root):
+    moments = moments_of(checkpoint, dataset_root, episode=1)
+    assert moments.steps == [0, 4, 8, 12]  # of 13
+    assert moments.points.shape == (4, N_POINTS, 3)
+    assert moments.saliency.max(axis=1) == pytest.approx(1)
+    assert moments.actions.shape == (4, 3, N_ACTIONS)
+
+
+def test_what_is_not_there(checkpoint, dataset_root, tmp_path):
+    with pytest.raises(UserError, match="--episode must be 0 to 2, got 3"):
+        moments_of(checkpoint, dataset_root, episode=3)
+    with pytest.raises(UserError, match=r"has no config\.json"):
+        moments_of(tmp_path / "none", dataset_root, episode=0)
+
+
+def test_every_ablation_has_saliency():
+    for conditioning in ("cross_attention", "adaln"):
+        policy = UCAFlowPolicy(make_config(conditioning=conditioning)).eval()
+        with torch.no_grad():
+            for parameter in policy.parameters():
+                parameter.add_(0.1 * torch.randn_like(parameter))
+        assert (saliency(policy, *inputs(policy)) > 0).any()
