@@ -167,12 +167,12 @@ class SceneClient:
     def frame(
         self, width: int, height: int, *, colour: bool
     ) -> tuple[float, NDArray[np.uint16], NDArray[np.uint8] | None]:
-        """Time [s], depth (H, W, 1) [mm] and colour (H, W, 3) of the newest frame."""
+        """Time [s], depth (H, W, 1) [mm] and colour (H, W, 3) of the newest frame, in memory that may be written."""
         reply = self.ask(request="frame", width=width, height=height, colour=colour)
-        depth = np.frombuffer(self._stream.read(width * height * 2), dtype=np.uint16).reshape(height, width, 1)
+        depth = np.frombuffer(self._stream.read(width * height * 2), dtype=np.uint16).reshape(height, width, 1).copy()
         if not colour:
             return reply["time"], depth, None
-        picture = np.frombuffer(self._stream.read(width * height * 3), dtype=np.uint8).reshape(height, width, 3)
+        picture = np.frombuffer(self._stream.read(width * height * 3), dtype=np.uint8).reshape(height, width, 3).copy()
         return reply["time"], depth, picture
 
     def close(self) -> None:
