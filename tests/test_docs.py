@@ -47,6 +47,7 @@ TINY = {
     "lerobot-uca-collect": ["--n_episodes=1", *TINY_CLOUD],
     "lerobot-train": ["--steps=2", "--batch_size=4", "--num_workers=0"],
     "lerobot-eval": ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false", *TINY_CLOUD],
+    "lerobot-uca-convert": ["--n_points=32"],
     "lerobot-uca-export": [],
     "benchmarks/control_loop.py": ["--steps=3", "--tasks", "dial-turn"],
     "benchmarks/fit.py": [],

@@ -26,7 +26,7 @@ ALLOWED = {
     "envs": {"bounds", "point_clouds", "errors", "features", "registry"},
     "data": {"bounds", "envs", "point_clouds", "errors", "features", "hub", "processes"},
     "robots": {"point_clouds", "errors", "features", "registry", "processes"},
-    "visual": {"policies", "data", "envs", "point_clouds", "errors", "features"},
+    "visual": {"bounds", "policies", "data", "envs", "point_clouds", "errors", "features"},
     "deploy": {"policies", "inference", "errors", "features"},
     "protocol": {"policies", "data", "envs", "errors", "features", "processes"},
     "checkpoints": {"data", "errors"},
@@ -73,9 +73,11 @@ def test_only_our_console_commands_are_installed():
         "lerobot-uca-benchmark",
         "lerobot-uca-calibrate",
         "lerobot-uca-collect",
+        "lerobot-uca-convert",
         "lerobot-uca-export",
         "lerobot-uca-saliency",
         "lerobot-uca-ur5e-sim",
+        "lerobot-uca-view",
     }
 
 

@@ -23,6 +23,17 @@ def collect() -> None:
     run()
 
 
+def convert() -> None:
+    """`lerobot-uca-convert`."""
+    end_by_signals()
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_uca.data.convert import run
+
+    register_third_party_plugins()
+    run()
+
+
 def export() -> None:
     """`lerobot-uca-export`."""
     end_by_signals()
@@ -36,6 +47,7 @@ def export() -> None:
 
 def calibrate() -> None:
     """`lerobot-uca-calibrate`."""
+    end_by_signals()
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from lerobot_uca.robots.calibrate import run
@@ -80,3 +92,14 @@ def saliency() -> None:
         main()
     except UserError as error:
         sys.exit(f"error: {error}")
+
+
+def view() -> None:
+    """`lerobot-uca-view`."""
+    end_by_signals()
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_uca.visual.view import run
+
+    register_third_party_plugins()
+    run()

@@ -5,10 +5,6 @@ from collections.abc import Iterable
 OBS_POINT_CLOUD = "observation.point_cloud"
 """(N, 3) float32 [m], in the frame that the environment or robot states."""
 
-RECIPE_INFO = "cloud_recipe"
-"""How a feature's clouds were made, or are to be made of its depth images: features[key]['info'][RECIPE_INFO] is a
-`CloudRecipe` as a dictionary."""
-
 POINT_CLOUD_KEYS = (OBS_POINT_CLOUD, "observation.pointcloud", "observation.pointcloud.xyz")
 """Keys under which a point cloud is found, in this order: this package's and other plugins'."""
 

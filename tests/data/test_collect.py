@@ -19,8 +19,8 @@ from lerobot_uca.data.demonstrations import Demonstration, demonstrate
 from lerobot_uca.envs.adroit import HAND
 from lerobot_uca.envs.configs import AdroitPointCloudConfig, MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO
-from lerobot_uca.point_clouds.recipe import CloudRecipe
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe
 
 
 def config(root, **changes):

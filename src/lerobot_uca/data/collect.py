@@ -28,8 +28,9 @@ from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt, smoothed
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO
+from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.hub import uploading
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO
 
 FIRST_SEED = 1_000_000
 """First seed of the demonstrations. LeRobot evaluates from seed 1000 upwards unless told otherwise."""

@@ -84,10 +84,14 @@ class DepthToCloud:
         Raises:
             DepthError: for an image of another size or type, and for too few points.
         """
-        points = self.points(images, max_points=CANDIDATES_PER_POINT * self.n_points)
+        points = self.candidates(images)
         if len(points) < self.min_points:
             raise DepthError(self._too_few(len(points), images))
         return sample_farthest(points, self.n_points)
+
+    def candidates(self, images: Sequence[NDArray[Any]]) -> Points:
+        """The points that the cloud is sampled from: those inside the crop, or evenly chosen ones, (M, 3) float32."""
+        return self.points(images, max_points=CANDIDATES_PER_POINT * self.n_points)
 
     def points(self, images: Sequence[NDArray[Any]], max_points: int | None = None) -> Points:
         """The points inside the crop, all of them or evenly chosen ones: (M, 3) float32, base frame [m]."""

@@ -129,7 +129,7 @@ class Crop:
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
-    def contains(self, points: Array) -> NDArray[np.bool_]:
+    def contains(self, points: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
         """Whether each of the points (N, 3) lies inside, (N,)."""
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 

@@ -20,6 +20,13 @@ CALIBRATION_VARIABLE = "LEROBOT_UCA_CALIBRATION"
 SIMULATED = "simulated"
 """The method of a calibration that is known."""
 
+RECIPE_INFO = "cloud_recipe"
+"""How a feature's clouds were made, or are to be made of its depth images: a LeRobot dataset's
+features[key]['info'][RECIPE_INFO] is a `CloudRecipe` as a dictionary."""
+
+Features = Mapping[str, Mapping[str, Any]]
+"""Of a LeRobot dataset."""
+
 SAME = (0.01, 0.001)
 """(mm, deg) Poses this close are the same: files round."""
 
@@ -187,3 +194,40 @@ def calibration_of(camera: str, calibrations: Mapping[str, Calibration] | None) 
         f"Camera '{camera}' needs a calibration, got {have}. Make one with lerobot-uca-calibrate --camera={camera} and "
         f"name its folder with {CALIBRATION_VARIABLE}."
     )
+
+
+def depth_keys(features: Features) -> list[str]:
+    """The features of a dataset that are depth images."""
+    return [
+        key
+        for key, feature in features.items()
+        if feature["dtype"] in ("image", "video") and (feature.get("info") or {}).get("is_depth_map")
+    ]
+
+
+def recipe_for(features: Features, crop: tuple[Any, Any] | None, n_points: int, folder: str | None) -> CloudRecipe:
+    """The recipe for all depth images of a dataset.
+
+    Calibrations are those of a folder or of $LEROBOT_UCA_CALIBRATION. A simulated camera comes with a recipe, in which
+    its calibration and a crop are.
+
+    Raises:
+        CalibrationError: if a calibration or the crop is missing.
+    """
+    installed = installed_calibrations(folder)
+    sources = []
+    for key in depth_keys(features):
+        info = features[key].get("info") or {}
+        if RECIPE_INFO in info:
+            own = CloudRecipe.from_dict(info[RECIPE_INFO])
+            crop = crop or (own.crop.low, own.crop.high)
+            known = {camera_of(source.key): source.calibration for source in own.sources}
+            calibration = calibration_of(camera_of(key), known)
+        else:
+            calibration = calibration_of(camera_of(key), installed)
+        sources.append(depth_source(key, info, calibration))
+    if crop is None:
+        raise CalibrationError(
+            "A cloud from depth needs a crop: give crop_low and crop_high, two corners [m] in the robot's base frame."
+        )
+    return CloudRecipe(tuple(sources), make_crop(*crop), n_points)

@@ -1,6 +1,5 @@
 """How a policy's cloud is made from a dataset's depth images, if it is: options, and what becomes of them."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,18 +7,16 @@ import numpy as np
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, RECIPE_INFO, find_point_cloud
+from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.recipe import (
+    RECIPE_INFO,
     CloudRecipe,
-    calibration_of,
-    camera_of,
-    depth_source,
+    Features,
+    depth_keys,
     installed_calibrations,
-    make_crop,
+    recipe_for,
 )
-
-Features = Mapping[str, Mapping[str, Any]]
 
 
 @dataclass
@@ -84,43 +81,6 @@ class DepthConfig:
         if self.crop_low is None or self.crop_high is None:
             return None
         return self.crop_low, self.crop_high
-
-
-def depth_keys(features: Features) -> list[str]:
-    """The features of a dataset that are depth images."""
-    return [
-        key
-        for key, feature in features.items()
-        if feature["dtype"] in ("image", "video") and (feature.get("info") or {}).get("is_depth_map")
-    ]
-
-
-def recipe_for(features: Features, crop: tuple[Any, Any] | None, n_points: int, folder: str | None) -> CloudRecipe:
-    """The recipe for all depth images of a dataset.
-
-    Calibrations are those of a folder or of $LEROBOT_UCA_CALIBRATION. A simulated camera comes with a recipe, in which
-    its calibration and a crop are.
-
-    Raises:
-        CalibrationError: if a calibration or the crop is missing.
-    """
-    installed = installed_calibrations(folder)
-    sources = []
-    for key in depth_keys(features):
-        info = features[key].get("info") or {}
-        if RECIPE_INFO in info:
-            own = CloudRecipe.from_dict(info[RECIPE_INFO])
-            crop = crop or (own.crop.low, own.crop.high)
-            known = {camera_of(source.key): source.calibration for source in own.sources}
-            calibration = calibration_of(camera_of(key), known)
-        else:
-            calibration = calibration_of(camera_of(key), installed)
-        sources.append(depth_source(key, info, calibration))
-    if crop is None:
-        raise CalibrationError(
-            "A cloud from depth needs a crop: give crop_low and crop_high, two corners [m] in the robot's base frame."
-        )
-    return CloudRecipe(tuple(sources), make_crop(*crop), n_points)
 
 
 def _check_same(kept: CloudRecipe, recipe: CloudRecipe) -> None:

@@ -1,0 +1,94 @@
+"""How good recorded clouds are: numbers as text, and a picture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.errors import UserError
+
+
+class EpisodeReport(NamedTuple):
+    """What one episode of L steps was like."""
+
+    episode: int
+    n_points: NDArray[np.int_]  # (L,) points inside the crop, before sampling
+    invalid: NDArray[np.float64]  # (L,) share of pixels without depth, or of points that are not finite
+    low: NDArray[np.float32]  # (3,) lowest corner of the sampled clouds [m]
+    high: NDArray[np.float32]  # (3,) highest corner [m]
+    state: NDArray[np.float32]  # (L, S)
+    action: NDArray[np.float32]  # (L, A)
+
+
+def write_report(folder: Path, episodes: Sequence[EpisodeReport], least: int) -> None:
+    """Write report.txt and report.png into a folder.
+
+    Args:
+        folder: made if need be.
+        episodes: at least one.
+        least: a frame with fewer points is too empty.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "report.txt").write_text("\n".join(summarise(episodes, least)) + "\n", encoding="utf-8")
+        _draw(folder / "report.png", episodes, least)
+    except OSError as error:
+        raise UserError(f"Cannot write the report: {error}") from error
+
+
+def summarise(episodes: Sequence[EpisodeReport], least: int) -> list[str]:
+    """The report's lines."""
+    n_points = np.concatenate([each.n_points for each in episodes])
+    invalid = np.concatenate([each.invalid for each in episodes])
+    low = np.nanmin([each.low for each in episodes], axis=0)
+    high = np.nanmax([each.high for each in episodes], axis=0)
+    empty = [(each.episode, int(frame)) for each in episodes for frame in np.flatnonzero(each.n_points < least)]
+    lines = [
+        f"{len(episodes)} episodes, {len(n_points)} frames",
+        f"points inside the crop a frame: at least {n_points.min()}, median {np.median(n_points):.0f}",
+        f"frames with fewer than {least} points: {len(empty)}" + _listed("episode {} frame {}", empty),
+        f"share of invalid depth or points: median {np.median(invalid):.1%}, at most {invalid.max():.1%}",
+        f"clouds lie in (normalisation range): {_numbers(low)} to {_numbers(high)} m",
+    ]
+    for name in ("state", "action"):
+        values = np.concatenate([getattr(each, name) for each in episodes])
+        n_bad = int((~np.isfinite(values)).any(axis=1).sum())
+        constant = np.flatnonzero(np.ptp(values, axis=0) == 0).tolist()
+        lines += [
+            f"{name}: {values.shape[1]} dimensions, {n_bad} frames with NaN or infinite values",
+            f"{name} dimensions that are constant: {', '.join(map(str, constant)) or 'none'}",
+            f"{name} range: {_numbers(np.nanmin(values, axis=0))} to {_numbers(np.nanmax(values, axis=0))}",
+        ]
+    return lines
+
+
+def _listed(pattern: str, pairs: list[tuple[int, int]]) -> str:
+    shown = ", ".join(pattern.format(*pair) for pair in pairs[:10])
+    return f" ({shown}{', ...' if len(pairs) > 10 else ''})" if pairs else ""
+
+
+def _numbers(values: NDArray[np.float32]) -> str:
+    return "[" + ", ".join(f"{value:.3g}" for value in values) + "]"
+
+
+def _draw(file: Path, episodes: Sequence[EpisodeReport], least: int) -> None:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError(
+            "The report's picture needs matplotlib: pip install 'lerobot_policy_uca_flow[pictures]'."
+        ) from error
+    figure = Figure(figsize=(10, 6), layout="constrained")
+    points_axes, invalid_axes = figure.subplots(2, 1, sharex=True)
+    points_axes.plot(np.concatenate([each.n_points for each in episodes]), linewidth=0.8)
+    points_axes.axhline(least, color="tab:red", linewidth=0.8, label=f"least, {least}")
+    points_axes.set(ylabel="points inside the crop", yscale="symlog")
+    points_axes.legend()
+    invalid_axes.plot(100 * np.concatenate([each.invalid for each in episodes]), color="tab:orange", linewidth=0.8)
+    invalid_axes.set(ylabel="invalid [%]", xlabel="frame, episodes one after the other")
+    for end in np.cumsum([len(each.n_points) for each in episodes])[:-1]:
+        for axes in (points_axes, invalid_axes):
+            axes.axvline(end - 0.5, color="0.8", linewidth=0.5)
+    figure.savefig(file, dpi=100)

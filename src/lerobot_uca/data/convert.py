@@ -1,0 +1,246 @@
+"""`lerobot-uca-convert`: recorded depth or clouds to a LeRobot dataset of point clouds, which trains fast.
+
+Example:
+    lerobot-uca-convert --source=data/depth --repo_id=me/clouds --crop_low='[0.2,-0.3,0.01]' --crop_high='[0.8,0.3,0.4]'
+"""
+
+import importlib.metadata
+import logging
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from huggingface_hub.errors import HFValidationError
+from huggingface_hub.utils import validate_repo_id
+from lerobot.configs import parser
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
+from lerobot.utils.utils import SuppressProgressBars
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from lerobot_uca.bounds import check_bounds, within
+from lerobot_uca.data.cloud_report import EpisodeReport, write_report
+from lerobot_uca.data.cloud_sources import LeRobotSource, Source, find_source
+from lerobot_uca.data.whole_folder import whole_folder
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.calibration import CalibrationError
+from lerobot_uca.point_clouds.depth import MIN_SHARE
+from lerobot_uca.point_clouds.geometry import sample_farthest
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, depth_keys, make_crop, recipe_for
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class ConvertConfig:
+    """Make a LeRobot dataset of point clouds from recorded depth or clouds. States, actions, tasks and fps are kept.
+
+    lerobot-uca-convert --source=data/depth --repo_id=me/clouds --crop_low='[0.2,-0.3,0]' --crop_high='[0.8,0.3,0.4]'
+
+    The source is a LeRobot dataset with depth (video or TIFF; calibrated by $LEROBOT_UCA_CALIBRATION or --calibration)
+    or with clouds, a zarr of DP3's layout, or a folder of PLY or NPZ clouds with a frames.csv (docs/own_data.md).
+    """
+
+    # What to convert: a folder.
+    source: Path
+    # Name of the new dataset, 'user/name'.
+    repo_id: str
+    # Folder to write; by default where LeRobot looks for it, $HF_LEROBOT_HOME/repo_id.
+    root: Path | None = None
+    # Lowest corner of the crop [m], in the robot's base frame. Depth needs a crop; lerobot-uca-view shows one.
+    crop_low: tuple[float, float, float] | None = None
+    # Highest corner of the crop [m].
+    crop_high: tuple[float, float, float] | None = None
+    # Points of each cloud.
+    n_points: int = within(512, least=1, most=100_000)
+    # Folder of the cameras' calibrations; by default $LEROBOT_UCA_CALIBRATION.
+    calibration: str | None = None
+    # Which episodes, such as [0,1,5]; by default all.
+    episodes: list[int] | None = None
+    # Steps a second of a source that does not know it (zarr, PLY, NPZ).
+    fps: int | None = within(None, least=1, most=10_000)
+    # What was done, for a source that does not know it.
+    task: str = ""
+    # Processes that read and sample; 0 does it in this one.
+    num_workers: int = within(0, least=0, most=1024)
+    # Write a report on the clouds' quality into this folder: report.txt and report.png.
+    report: Path | None = None
+    # Replace the folder if it exists.
+    overwrite: bool = False
+
+
+class Episode(NamedTuple):
+    """One converted episode of L steps."""
+
+    clouds: NDArray[np.float32]  # (L, N, 3)
+    state: NDArray[np.float32]  # (L, S)
+    action: NDArray[np.float32]  # (L, A)
+    tasks: list[str]
+    report: EpisodeReport
+
+
+def convert(config: ConvertConfig) -> LeRobotDataset:
+    """Convert, write whole or not at all, and open the new dataset.
+
+    Raises:
+        UserError: for a source that cannot be read or does not fit, and for frames with too few points.
+    """
+    try:
+        validate_repo_id(config.repo_id)
+    except HFValidationError as error:
+        raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
+    check_bounds(config)
+    source = make_source(config)
+    fps = source.fps or config.fps
+    if fps is None:
+        raise UserError(f"'{config.source}' does not say how many steps a second it has: give --fps.")
+    episodes = _chosen(config.episodes, source.n_episodes)
+    root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
+    with whole_folder(root, overwrite=config.overwrite) as unfinished:
+        _write(config, source, fps, episodes, unfinished)
+    if left_out := source.left_out():
+        logger.warning("Not kept: %s.", ", ".join(left_out))
+    return LeRobotDataset(config.repo_id, root=root)
+
+
+def make_source(config: ConvertConfig) -> Source:
+    """The source as configured, with its crop and, for depth, its recipe."""
+    if (config.crop_low is None) != (config.crop_high is None):
+        raise UserError("Give both crop_low and crop_high, or neither.")
+    corners = None if config.crop_low is None or config.crop_high is None else (config.crop_low, config.crop_high)
+    try:
+        source = find_source(config.source, make_crop(*corners) if corners else None, config.task)
+        if isinstance(source, LeRobotSource):
+            features = source.features
+            if depth_keys(features):
+                source.depth_recipe = recipe_for(features, corners, config.n_points, config.calibration)
+    except CalibrationError as error:
+        raise UserError(str(error)) from error
+    return source
+
+
+def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
+    """Read and sample one episode."""
+    frames = source.frames(episode)
+    clouds = [_sample(frame.points, n_points) for frame in frames]
+    state, action = (np.stack([getattr(frame, name) for frame in frames]) for name in ("state", "action"))
+    report = EpisodeReport(
+        episode,
+        n_points=np.array([frame.n_points for frame in frames]),
+        invalid=np.array([frame.invalid for frame in frames]),
+        low=np.min([cloud.min(axis=0) for cloud in clouds], axis=0),
+        high=np.max([cloud.max(axis=0) for cloud in clouds], axis=0),
+        state=state,
+        action=action,
+    )
+    return Episode(np.stack(clouds), state, action, [frame.task for frame in frames], report)
+
+
+def _sample(points: NDArray[np.float32], n_points: int) -> NDArray[np.float32]:
+    """As `DepthToCloud` samples. An empty cloud stays visible as NaN until the report is written."""
+    if len(points) == 0:
+        return np.full((n_points, 3), np.nan, np.float32)
+    return sample_farthest(points, n_points)
+
+
+def _chosen(episodes: list[int] | None, n_episodes: int) -> list[int]:
+    chosen = list(range(n_episodes)) if episodes is None else episodes
+    wrong = [episode for episode in chosen if not 0 <= episode < n_episodes]
+    if wrong or not chosen or len(set(chosen)) < len(chosen):
+        raise UserError(f"episodes must be different ones from 0 to {n_episodes - 1}, got {chosen}.")
+    return chosen
+
+
+def _write(config: ConvertConfig, source: Source, fps: int, episodes: list[int], root: Path) -> None:
+    dataset: LeRobotDataset | None = None
+    reports: list[EpisodeReport] = []
+    least = max(1, int(MIN_SHARE * config.n_points))
+    try:
+        for episode in _converted(config, source, episodes):
+            reports.append(episode.report)
+            if dataset is None:
+                features = _features(config, source, episode)
+                dataset = LeRobotDataset.create(config.repo_id, fps, features=features, root=root, use_videos=False)
+            if all(report.n_points.min() >= least for report in reports):
+                _add(dataset, episode)
+            elif config.report is None:
+                break  # nothing will be written; a report would look at the rest, too
+    finally:
+        if dataset is not None:
+            dataset.finalize()  # closes its files, which would otherwise come back when they are garbage-collected
+    if config.report is not None:
+        write_report(config.report, reports, least)
+    for report in reports:
+        few = np.flatnonzero(report.n_points < least)
+        if len(few):
+            raise UserError(
+                f"Episode {report.episode} has {len(few)} of {len(report.n_points)} frames with fewer than {least} "
+                f"points inside the crop, the first is frame {few[0]} with {report.n_points[few[0]]}. Widen the crop, "
+                "or leave the episode out with --episodes; --report=FOLDER shows all."
+            )
+
+
+def _converted(config: ConvertConfig, source: Source, episodes: list[int]) -> Iterator[Episode]:
+    convert_one = partial(convert_episode, source, config.n_points)
+    bar = partial(tqdm, total=len(episodes), desc="Converted", unit="episode")
+    if config.num_workers == 0:
+        yield from bar(map(convert_one, episodes))
+        return
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(config.num_workers, mp_context=context) as pool:
+        try:
+            yield from bar(pool.map(convert_one, episodes))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _add(dataset: LeRobotDataset, episode: Episode) -> None:
+    for cloud, state, action, task in zip(episode.clouds, episode.state, episode.action, episode.tasks, strict=True):
+        dataset.add_frame({OBS_POINT_CLOUD: cloud, OBS_STATE: state, ACTION: action, "task": task})
+    with SuppressProgressBars():
+        dataset.save_episode()
+
+
+def _features(config: ConvertConfig, source: Source, episode: Episode) -> dict[str, dict[str, Any]]:
+    recipe = source.recipe
+    crop = source.crop
+    info: dict[str, Any] = {
+        "conversion": {
+            "source": source.path.name,
+            "kind": type(source).__name__.removesuffix("Source"),
+            "crop": [list(crop.low), list(crop.high)] if crop else None,
+            "n_points": config.n_points,
+            "order": "farthest point sampling",
+            "version": importlib.metadata.version("lerobot_policy_uca_flow"),
+        }
+    }
+    if recipe is not None:
+        info[RECIPE_INFO] = recipe.as_dict()
+    return {
+        OBS_POINT_CLOUD: {
+            "dtype": "float32",
+            "shape": (config.n_points, 3),
+            "names": ["point", "xyz"],
+            "info": info,
+        },
+        **{
+            key: {"dtype": "float32", "shape": values.shape[1:], "names": source.names(key)}
+            for key, values in ((OBS_STATE, episode.state), (ACTION, episode.action))
+        },
+    }
+
+
+@parser.wrap()
+def run(config: ConvertConfig) -> None:
+    """Convert and say what was written."""
+    dataset = convert(config)
+    print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames of {config.n_points} points: {dataset.root}")
+    if config.report is not None:
+        print(f"Report: {config.report / 'report.txt'} and {config.report / 'report.png'}")

@@ -1,0 +1,282 @@
+"""Recorded depth and clouds to a dataset of clouds."""
+
+import csv
+import json
+import sys
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tests.builders import write_dataset
+from tests.depth_builders import (
+    CROP,
+    DEPTH_KEY,
+    N_CLOUD_POINTS,
+    live_frame,
+    make_calibration,
+    make_recipe,
+    write_depth_dataset,
+)
+
+from lerobot_uca.data import convert as command
+from lerobot_uca.data.batched_dataset import BatchedDataset
+from lerobot_uca.data.convert import ConvertConfig, convert
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, RECIPE_INFO, CloudRecipe
+
+
+@pytest.fixture
+def calibrated(tmp_path, monkeypatch):
+    folder = tmp_path / "calibration"
+    make_calibration().write(folder)
+    monkeypatch.setenv(CALIBRATION_VARIABLE, str(folder))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def depth_dataset(tmp_path_factory):
+    return write_depth_dataset(tmp_path_factory.mktemp("depth") / "data", video=False)
+
+
+def config(source, root, **changes):
+    crop = {"crop_low": CROP.low, "crop_high": CROP.high}
+    return ConvertConfig(
+        **{"source": source, "repo_id": "test/clouds", "root": root, "n_points": N_CLOUD_POINTS, **crop, **changes}
+    )
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
+@pytest.mark.usefixtures("calibrated")
+def test_depth_becomes_the_clouds_that_the_preprocessor_makes(depth_dataset, tmp_path, num_workers):
+    dataset = convert(config(depth_dataset.root, tmp_path / "clouds", num_workers=num_workers))
+    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (2, 12, 20)
+    make = make_recipe().make()
+    for index in range(12):
+        new, old = dataset[index], depth_dataset[index]
+        np.testing.assert_array_equal(new[OBS_POINT_CLOUD].numpy(), make([live_frame(index)]))
+        np.testing.assert_array_equal(new["observation.state"], old["observation.state"])
+        np.testing.assert_array_equal(new["action"], old["action"])
+        assert (new["task"], new["episode_index"], new["frame_index"]) == (
+            "push",
+            old["episode_index"],
+            old["frame_index"],
+        )
+    assert [path.name for path in tmp_path.iterdir() if path.name != "calibration"] == ["clouds"]
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_the_new_dataset_knows_how_it_was_made_and_reads_fast(depth_dataset, tmp_path):
+    dataset = convert(config(depth_dataset.root, tmp_path / "clouds", episodes=[1]))
+    assert (dataset.num_episodes, dataset.num_frames) == (1, 6)
+    info = dataset.features[OBS_POINT_CLOUD]["info"]
+    assert CloudRecipe.from_dict(info[RECIPE_INFO]) == make_recipe()
+    conversion = info["conversion"]
+    assert (conversion["source"], conversion["kind"], conversion["n_points"]) == ("data", "LeRobot", N_CLOUD_POINTS)
+    assert conversion["order"] == "farthest point sampling"
+    assert BatchedDataset("test/clouds", root=dataset.root).is_batched
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_video_is_converted_too(tmp_path):
+    source = write_depth_dataset(tmp_path / "video", video=True, n_episodes=1)
+    dataset = convert(config(source.root, tmp_path / "clouds"))
+    points = make_recipe().make().points([live_frame(0)])
+    cloud = dataset[0][OBS_POINT_CLOUD].numpy()
+    off = np.linalg.norm(cloud[:, None] - points[None], axis=-1).min(axis=1)
+    assert np.median(off) < 0.002
+
+
+# Data made elsewhere ------------------------------------------------------------------------------------------------
+
+
+def write_zarr(path, *, channels=6, lengths=(5, 7), without=()):
+    """As DP3 lays out its demonstrations."""
+    zarr = pytest.importorskip("zarr")
+    rng = np.random.default_rng(0)
+    n_steps = sum(lengths)
+    arrays = {
+        "data/point_cloud": rng.uniform(-0.1, 1.0, (n_steps, 600, channels)),
+        "data/state": rng.normal(size=(n_steps, 9)),
+        "data/action": rng.normal(size=(n_steps, 4)),
+        "data/img": np.zeros((n_steps, 4, 4, 3)),
+        "meta/episode_ends": np.cumsum(lengths),
+    }
+    group = zarr.open_group(str(path), mode="w", zarr_format=2)
+    for key, values in arrays.items():
+        if key not in without:
+            group.create_array(key, data=values.astype(np.int64 if key.startswith("meta") else np.float32))
+    return arrays
+
+
+def test_dp3s_zarr(tmp_path, caplog):
+    arrays = write_zarr(tmp_path / "drawer.zarr")
+    dataset = convert(config(tmp_path / "drawer.zarr", tmp_path / "clouds", fps=10, task="close the drawer"))
+    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (2, 12, 10)
+    for index in range(12):
+        frame = dataset[index]
+        np.testing.assert_array_equal(frame["observation.state"], arrays["data/state"][index].astype(np.float32))
+        np.testing.assert_array_equal(frame["action"], arrays["data/action"][index].astype(np.float32))
+        cloud, source = frame[OBS_POINT_CLOUD].numpy(), arrays["data/point_cloud"][index, :, :3].astype(np.float32)
+        assert CROP.contains(cloud).all()
+        assert set(map(tuple, cloud)) <= set(map(tuple, source))
+        assert len(np.unique(cloud, axis=0)) == N_CLOUD_POINTS
+        assert (frame["task"], frame["episode_index"]) == ("close the drawer", index >= 5)
+    assert "Not kept: data/img, colours of data/point_cloud." in caplog.messages
+
+
+def test_without_a_crop_all_points_count(tmp_path):
+    write_zarr(tmp_path / "a.zarr", channels=3)
+    dataset = convert(config(tmp_path / "a.zarr", tmp_path / "clouds", fps=10, crop_low=None, crop_high=None))
+    assert dataset.meta.stats[OBS_POINT_CLOUD]["min"].min() < -0.05
+    assert dataset.features[OBS_POINT_CLOUD]["info"]["conversion"]["crop"] is None
+
+
+@pytest.mark.parametrize("colours", [0, 3])
+def test_the_layout_of_lerobots_open_pull_request(tmp_path, colours, caplog):
+    """PR 4696: observation.pointcloud (N, 3 or 6), intrinsics (3, 3) and extrinsics (4, 4) by camera."""
+    features = {
+        "observation.pointcloud": {"dtype": "float32", "shape": (90, 3 + colours), "names": None},
+        "observation.intrinsics.front": {"dtype": "float32", "shape": (3, 3), "names": None},
+        "observation.extrinsics.front": {"dtype": "float32", "shape": (4, 4), "names": None},
+        "observation.state": {"dtype": "float32", "shape": (7,), "names": None},
+        "action": {"dtype": "float32", "shape": (7,), "names": None},
+    }
+    source = write_dataset(tmp_path / "source", n_episodes=2, length=4, features=features)
+    dataset = convert(config(source.root, tmp_path / "clouds", crop_low=(-5, -5, -5), crop_high=(5, 5, 5)))
+    assert dataset.num_frames == source.num_frames
+    theirs = source[3]["observation.pointcloud"].numpy()[:, :3]
+    assert set(map(tuple, dataset[3][OBS_POINT_CLOUD].numpy())) <= set(map(tuple, theirs))
+    assert "Not kept: observation.intrinsics.front, observation.extrinsics.front." in caplog.messages
+
+
+def write_folder(folder, kind, *, n_frames=4):
+    plyfile = pytest.importorskip("plyfile")
+    rng = np.random.default_rng(0)
+    folder.mkdir()
+    rows, clouds = [], []
+    for index in range(n_frames):
+        points = rng.uniform([0.1, -0.4, 0], [1, 0.4, 0.5], (200, 3)).astype(np.float32)
+        points[:10] = np.nan
+        name = f"{index}.{kind}"
+        if kind == "npz":
+            np.savez(folder / name, points=points)
+        else:
+            vertices = np.array([tuple(p) for p in points], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+            plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(str(folder / name))
+        rows.append(
+            [name, index // 2, f"task {index // 2}", *rng.normal(size=3).round(3), *rng.normal(size=2).round(3)]
+        )
+        clouds.append(points)
+    with (folder / "frames.csv").open("w", newline="") as opened:
+        writer = csv.writer(opened)
+        writer.writerow(["file", "episode", "task", "state_x", "state_y", "state_z", "action_x", "action_grip"])
+        writer.writerows(rows)
+    return rows, clouds
+
+
+@pytest.mark.parametrize("kind", ["npz", "ply"])
+def test_a_folder_of_files(tmp_path, kind):
+    rows, clouds = write_folder(tmp_path / "recorded", kind)
+    dataset = convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5))
+    assert (dataset.num_episodes, dataset.num_frames) == (2, 4)
+    assert dataset.features["action"]["names"] == ["x", "grip"]
+    for index, (row, cloud) in enumerate(zip(rows, clouds, strict=True)):
+        frame = dataset[index]
+        np.testing.assert_allclose(frame["observation.state"], row[3:6], atol=1e-6)
+        np.testing.assert_allclose(frame["action"], row[6:], atol=1e-6)
+        assert frame["task"] == row[2]
+        assert set(map(tuple, frame[OBS_POINT_CLOUD].numpy())) <= set(map(tuple, cloud))
+
+
+# The report ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_report_tells_what_is_wrong_and_nothing_is_written(tmp_path):
+    _, clouds = write_folder(tmp_path / "recorded", "npz")
+    np.savez(tmp_path / "recorded" / "3.npz", points=clouds[3][:20] + 5)
+    with pytest.raises(UserError, match="Episode 1 has 1 of 2 frames with fewer than 6 points inside the crop, the fi"):
+        convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, report=tmp_path / "report"))
+    assert not (tmp_path / "clouds").exists()
+    text = (tmp_path / "report" / "report.txt").read_text()
+    assert "2 episodes, 4 frames" in text
+    assert "points inside the crop a frame: at least 0, median" in text
+    assert "frames with fewer than 6 points: 1 (episode 1 frame 1)" in text
+    assert "share of invalid depth or points: median 5.0%, at most 50.0%" in text
+    assert "state dimensions that are constant: none" in text
+    assert (tmp_path / "report" / "report.png").stat().st_size > 5000
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_a_report_of_depth(depth_dataset, tmp_path):
+    convert(config(depth_dataset.root, tmp_path / "clouds", report=tmp_path / "report"))
+    text = (tmp_path / "report" / "report.txt").read_text()
+    share = np.mean([((frame == 0) | (frame >= 10000)).mean() for frame in map(live_frame, range(12))])
+    assert f"share of invalid depth or points: median {share:.1%}" in text
+    n_points = [len(make_recipe().make().points([live_frame(index)])) for index in range(12)]
+    assert f"at least {min(n_points)}, median {np.median(n_points):.0f}" in text
+
+
+# Wrong input --------------------------------------------------------------------------------------------------------
+
+
+def test_wrong_sources(tmp_path, depth_dataset, monkeypatch):
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+    write_zarr(tmp_path / "a.zarr", without=("data/state",))
+    write_zarr(tmp_path / "ends.zarr", lengths=(5, 7), without=("meta/episode_ends",))
+    (tmp_path / "empty.zarr").mkdir()
+    write_folder(tmp_path / "recorded", "npz")
+    (tmp_path / "columns").mkdir()
+    (tmp_path / "columns" / "frames.csv").write_text("file,episode\na,0\n")
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "frames.csv").write_text("file,episode,state_x,action_x\na.npz,0,1,2\n")
+    wrong = {
+        "must be a LeRobot dataset": config(tmp_path / "nothing", tmp_path / "out"),
+        "data/state is missing, got data/action, data/img": config(tmp_path / "a.zarr", tmp_path / "out", fps=5),
+        "meta/episode_ends is missing": config(tmp_path / "ends.zarr", tmp_path / "out", fps=5),
+        "cannot be read as zarr": config(tmp_path / "empty.zarr", tmp_path / "out", fps=5),
+        "must have the columns file, episode, state_": config(tmp_path / "columns", tmp_path / "out", fps=5),
+        "a.npz' .frames.csv. cannot be read": config(tmp_path / "files", tmp_path / "out", fps=5),
+        "does not say how many steps a second": config(tmp_path / "recorded", tmp_path / "out"),
+        "Camera 'front' needs a calibration": config(depth_dataset.root, tmp_path / "out"),
+        "Give both crop_low and crop_high": config(depth_dataset.root, tmp_path / "out", crop_low=None),
+        "low below high": config(depth_dataset.root, tmp_path / "out", crop_low=(1, 1, 1), crop_high=(0, 0, 0)),
+        "episodes must be different ones from 0 to 1, got .2.": config(
+            tmp_path / "recorded", tmp_path / "out", fps=5, episodes=[2]
+        ),
+        "n_points must be at least 1": config(tmp_path / "recorded", tmp_path / "out", fps=5, n_points=0),
+        "repo_id must be 'user/name'": config(tmp_path / "recorded", tmp_path / "out", fps=5, repo_id="a/b/c"),
+    }
+    for message, each in wrong.items():
+        with pytest.raises(UserError, match=message):
+            convert(each)
+    assert not (tmp_path / "out").exists()
+
+
+def test_depth_needs_a_crop(depth_dataset, tmp_path, calibrated):
+    with pytest.raises(UserError, match="A cloud from depth needs a crop"):
+        convert(config(depth_dataset.root, tmp_path / "out", crop_low=None, crop_high=None))
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_a_full_disk_leaves_nothing(depth_dataset, tmp_path, monkeypatch):
+    def full(self):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(LeRobotDataset, "save_episode", full)
+    with pytest.raises(UserError, match=r"Cannot write .*No space left on device"):
+        convert(config(depth_dataset.root, tmp_path / "out"))
+    assert [path.name for path in tmp_path.iterdir()] == ["calibration"]
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_the_command(depth_dataset, tmp_path, monkeypatch, capsys):
+    arguments = [
+        *(f"--source={depth_dataset.root}", "--repo_id=test/clouds", f"--root={tmp_path / 'clouds'}"),
+        *(f"--crop_low={list(CROP.low)}", f"--crop_high={list(CROP.high)}", "--n_points=48", "--episodes=[0]"),
+    ]
+    monkeypatch.setattr(sys, "argv", ["lerobot-uca-convert", *arguments])
+    command.run()
+    assert f"1 episodes, 6 frames of 48 points: {tmp_path / 'clouds'}" in capsys.readouterr().out
+    assert json.loads((tmp_path / "clouds" / "meta" / "info.json").read_text())["total_frames"] == 6
+    assert DEPTH_KEY not in LeRobotDataset("test/clouds", root=tmp_path / "clouds").features
