@@ -6,7 +6,8 @@ It is also the shortest complete use of a checkpoint from Python: environment, p
 """
 
 import argparse
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -49,11 +50,14 @@ def main() -> None:
     mpl.use("Agg")
     figure = plt.figure(figsize=(5 * N_MOMENTS, 9))
     observation, _ = env.reset(seed=args.seed)
+    n_steps = policy.config.obs_span + 1
+    batches: deque[dict[str, torch.Tensor]] = deque(maxlen=n_steps)  # what `select_action` remembers by itself
     for step in range(args.every * (N_MOMENTS - 1) + 1):
         batch = preprocess(preprocess_observation({key: value[None] for key, value in observation.items()}))
+        batches.extend([batch] * (1 if batches else n_steps))  # the first one stands for those before it
         moment, rest = divmod(step, args.every)
         if rest == 0:
-            actions = sample_actions(policy, batch, postprocess)
+            actions = sample_actions(policy, list(batches)[:: policy.config.obs_stride], postprocess)
             axes = figure.add_subplot(2, N_MOMENTS, moment + 1)
             axes.imshow(env.render())
             axes.set_title(f"{args.task}, step {step}")
@@ -74,14 +78,13 @@ def main() -> None:
 
 
 def sample_actions(
-    policy: UCAFlowPolicy, batch: dict[str, torch.Tensor], postprocess: Callable[[torch.Tensor], torch.Tensor]
+    policy: UCAFlowPolicy,
+    observed: Sequence[dict[str, torch.Tensor]],
+    postprocess: Callable[[torch.Tensor], torch.Tensor],
 ) -> NDArray[np.float32]:
-    """Several predictions for one observation, (samples, steps, 4), in the environment's units."""
-    keys = (OBS_POINT_CLOUD, OBS_STATE)
-    # The same frame twice stands for the history: at this speed it hardly differs.
-    history = {
-        key: batch[key].unsqueeze(1).expand(N_SAMPLES, policy.config.n_obs_steps, *batch[key].shape[1:]) for key in keys
-    }
+    """Several predictions from the observed steps, oldest first: (samples, actions, 4), in the environment's units."""
+    steps = {key: torch.stack([batch[key] for batch in observed], dim=1) for key in (OBS_POINT_CLOUD, OBS_STATE)}
+    history = {key: value.expand(N_SAMPLES, *value.shape[1:]) for key, value in steps.items()}  # equal, each with noise
     return postprocess(policy.predict_action_chunk(history)).numpy()
 
 

@@ -67,7 +67,7 @@ def test_where_a_runtime_fails_pytorch_steps_in(runtime, monkeypatch, caplog):
 
 
 @every_runtime
-def test_weights_that_diverged_are_no_runtimes_fault(runtime, caplog):
+def test_diverged_weights_are_not_blamed_on_the_runtime(runtime, caplog):
     network = make_network()
     with torch.no_grad():
         network[0].weight.fill_(torch.nan)
