@@ -1,5 +1,6 @@
 """Tiny configurations, batches and datasets that the tests are made of."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,13 @@ def make_config(**changes: object) -> UCAFlowConfig:
     return UCAFlowConfig(**{**make_settings(), **SMALL_POLICIES["uca_flow"], **changes})
 
 
+def make_statistics() -> dict[str, dict[str, np.ndarray]]:
+    """A dataset's statistics with which normalisation changes nothing."""
+    values = {"min": -1.0, "max": 1.0, "mean": 0.0, "std": 0.5}
+    sizes = {OBS_POINT_CLOUD: 3, "observation.state": N_STATES, "action": N_ACTIONS}
+    return {key: {name: np.full(n, value) for name, value in values.items()} for key, n in sizes.items()}
+
+
 def make_batch(config: UCAFlowConfig, batch_size: int = 8) -> dict[str, torch.Tensor]:
     """A batch of training windows with values in [-1, 1]."""
     n_obs = config.n_obs_steps
@@ -65,9 +73,19 @@ def make_observation(batch_size: int = 1) -> dict[str, torch.Tensor]:
 
 
 def write_dataset(
-    root: Path, *, n_episodes: int = 3, length: int = 12, features: dict | None = None, point_cloud: object = None
+    root: Path,
+    *,
+    n_episodes: int = 3,
+    length: int = 12,
+    features: dict | None = None,
+    change: Callable[[dict, int, int], None] | None = None,
 ) -> LeRobotDataset:
-    """A small LeRobot dataset of random point clouds, states and actions."""
+    """A small LeRobot dataset of random numbers: point clouds, states and actions.
+
+    Args:
+        features: others than these.
+        change: called with each frame, its episode and its index in it, to change it.
+    """
     rng = np.random.default_rng(0)
     features = features or {
         OBS_POINT_CLOUD: {"dtype": "float32", "shape": (N_POINTS, 3), "names": ["point", "xyz"]},
@@ -76,18 +94,23 @@ def write_dataset(
     }
     dataset = LeRobotDataset.create("test/random", fps=80, features=features, root=root, use_videos=False)
     for episode in range(n_episodes):
-        for _ in range(length + episode):
+        for index in range(length + episode):
             frame = {
-                key: rng.normal(size=feature["shape"]).astype(feature["dtype"])
+                key: _random(rng, feature["dtype"], feature["shape"])
                 for key, feature in features.items()
-                if feature["dtype"] == "float32"
+                if feature["dtype"] not in ("string", "image", "video")
             }
-            if point_cloud is not None:
-                frame[OBS_POINT_CLOUD] = point_cloud
+            if change is not None:
+                change(frame, episode, index)
             dataset.add_frame({**frame, "task": f"task {episode % 2}"})
         dataset.save_episode()
     dataset.finalize()
     return LeRobotDataset("test/random", root=root)
+
+
+def _random(rng: np.random.Generator, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    is_float = np.issubdtype(np.dtype(dtype), np.floating)
+    return (rng.normal(size=shape) if is_float else rng.integers(0, 6, size=shape)).astype(dtype)
 
 
 def overfit(policy: PointCloudPolicy, n_steps: int) -> float:

@@ -196,11 +196,16 @@ def test_a_dataset_without_a_cloud(tmp_path):
 def test_a_dataset_with_nan_points(tmp_path):
     import numpy as np
 
-    cloud = np.zeros((N_POINTS, 3), np.float32)
-    cloud[3, 1] = np.nan
-    write_dataset(tmp_path / "data", point_cloud=cloud)
+    def spoil(frame, episode, index):
+        if (episode, index) == (1, 4):
+            frame[OBS_POINT_CLOUD][3, 1] = np.nan
+
+    write_dataset(tmp_path / "data", change=spoil)
     line = fail(*train(tmp_path / "data", tmp_path / "train"))
-    assert re.match(rf"error: '{OBS_POINT_CLOUD}' must be finite, got \d+ of \d+ values NaN or infinite", line)
+    assert line == (
+        f"error: '{OBS_POINT_CLOUD}' must be finite, got 1 of {3 * N_POINTS} values NaN or infinite in episode 1, "
+        "frame 4. --dataset.episodes=[0,2] leaves these episodes out."
+    )
     assert not (tmp_path / "train").exists()
 
 

@@ -9,10 +9,16 @@ POINT_CLOUD_KEYS = (OBS_POINT_CLOUD, "observation.pointcloud", "observation.poin
 """Keys under which a point cloud is found, in this order: this package's and other plugins'."""
 
 VALID_MASK_SUFFIX = ".valid_mask"
-"""Appended to a cloud's key (without .xyz): which of its points are valid, (N,) bool."""
+"""Appended to a cloud's key (without .xyz), it names which of its points are valid, (N,) bool."""
 
 
 def find_point_cloud(keys: Iterable[str]) -> str | None:
     """The key of the point cloud among these, if there is one."""
     known = set(keys)
     return next((key for key in POINT_CLOUD_KEYS if key in known), None)
+
+
+def valid_mask(key: str, keys: Iterable[str]) -> str | None:
+    """The key of the mask that belongs to the point cloud under a key, if it is among these."""
+    mask = key.removesuffix(".xyz") + VALID_MASK_SUFFIX
+    return mask if mask in set(keys) else None

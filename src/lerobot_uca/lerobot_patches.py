@@ -23,6 +23,7 @@ from lerobot.datasets import factory
 from lerobot.policies import factory as policy_factory
 from lerobot.processor import DataProcessorPipeline
 from lerobot.utils import utils
+from lerobot.utils.constants import ACTION, OBS_STATE
 from packaging.version import Version
 
 from lerobot_uca import configs
@@ -30,9 +31,12 @@ from lerobot_uca.checkpoints.resuming import cycle_exactly, without_trace
 from lerobot_uca.checkpoints.saving import save_whole, update_last
 from lerobot_uca.checkpoints.steps import check_steps
 from lerobot_uca.data.batched_dataset import BatchedDataset
+from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
 from lerobot_uca.errors import UserError, reported
+from lerobot_uca.features import find_point_cloud, valid_mask
 from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.processor_base import load_processors
 from lerobot_uca.policies.publishing import Evaluation, PublishedPolicy
 from lerobot_uca.processes import end_by_signals
 
@@ -85,6 +89,7 @@ def install() -> None:
     save_checkpoints_whole()
     resume_exactly()
     report_failed_uploads()
+    normalise_what_is_trained()
 
 
 def report_user_errors() -> None:
@@ -153,7 +158,7 @@ def make_registered_steps_only() -> None:
             token = _of_point_cloud_policy.set(True)
             try:
                 with reported(f"The processors of '{pretrained_path}' cannot be loaded"):
-                    return make(policy_cfg, pretrained_path, *args, **kwargs)
+                    return load_processors(make, policy_cfg, pretrained_path, *args, **kwargs)
             finally:
                 _of_point_cloud_policy.reset(token)
 
@@ -316,6 +321,40 @@ def read_in_batches() -> None:
         return dataset
 
     factory.make_dataset = make_and_settle
+
+
+def normalise_what_is_trained() -> None:
+    """The data of a training is finite, and its statistics are those of the chosen episodes.
+
+    LeRobot's are those of all episodes, held-out ones included; and a value that is not finite makes all of them NaN.
+    Fine-tuning a checkpoint, it asks neither whether the dataset has its features nor how many points a cloud has now.
+    """
+
+    def checked(make: Callable[..., Any]) -> Callable[..., Any]:
+        def make_train_eval_datasets(config: TrainPipelineConfig) -> Any:
+            datasets = make(config)
+            if isinstance(config.policy, PointCloudPolicyConfig):
+                for dataset in filter(None, datasets):
+                    _normalise_by_chosen_episodes(config.policy, dataset, config.rename_map)
+            return datasets
+
+        return make_train_eval_datasets
+
+    _replace(factory.make_train_eval_datasets, checked)
+
+
+def _normalise_by_chosen_episodes(policy: PointCloudPolicyConfig, dataset: Any, rename_map: dict[str, str]) -> None:
+    features = dataset.meta.features
+    renamed = {rename_map.get(key, key): feature for key, feature in features.items()}
+    if policy.pretrained_path:
+        policy.set_dataset_feature_metadata(renamed)  # LeRobot's own call does not rename
+        policy.check_dataset(renamed)
+    key_of = {rename_map.get(key, key): key for key in features}
+    used = {find_point_cloud(renamed), OBS_STATE, ACTION} & renamed.keys()
+    masks = {key_of[name]: key_of.get(valid_mask(name, renamed) or "") for name in used if name}
+    check_finite(dataset, masks)
+    if dataset.meta.stats:
+        dataset.meta.stats = {**dataset.meta.stats, **chosen_statistics(dataset, masks)}
 
 
 def _read_without_workers(config: TrainPipelineConfig, dataset: Any) -> None:

@@ -5,7 +5,15 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from tests.builders import N_ACTIONS, SMALL_POLICIES, make_batch, make_observation, make_settings, overfit
+from tests.builders import (
+    N_ACTIONS,
+    SMALL_POLICIES,
+    make_batch,
+    make_observation,
+    make_settings,
+    make_statistics,
+    overfit,
+)
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
@@ -56,7 +64,7 @@ def test_a_checkpoint_of_flowpolicys_former_type_loads(tmp_path):
 def test_lerobot_finds_policy_and_processors_by_the_types_name(name):
     policy = make(name)
     assert policy.name == policy.config.type == name
-    pre, post = make_pre_post_processors(policy.config)
+    pre, post = make_pre_post_processors(policy.config, dataset_stats=make_statistics())
     names = [step._registry_name for step in (*pre.steps, *post.steps)]
     assert {"normalizer_processor", "unnormalizer_processor"} <= set(names)
 

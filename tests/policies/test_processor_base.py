@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies.factory import make_pre_post_processors
-from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config, make_statistics
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
@@ -14,15 +14,8 @@ from lerobot_uca.policies.processor_base import PointCloudProcessorStep
 STATE = "observation.state"
 
 
-def stats():
-    """Statistics of which normalisation changes nothing."""
-    values = {"min": -1.0, "max": 1.0, "mean": 0.0, "std": 0.5}
-    sizes = {OBS_POINT_CLOUD: 3, STATE: N_STATES, "action": N_ACTIONS}
-    return {key: {name: np.full(n, value) for name, value in values.items()} for key, n in sizes.items()}
-
-
 def preprocessor(**changes):
-    return make_pre_post_processors(make_config(**changes), dataset_stats=stats())[0]
+    return make_pre_post_processors(make_config(**changes), dataset_stats=make_statistics())[0]
 
 
 def test_the_steps_and_their_names():
@@ -39,7 +32,7 @@ def test_the_steps_and_their_names():
 
 def test_the_step_is_saved_and_loaded(tmp_path):
     config = make_config(n_points=10)
-    pre, post = make_pre_post_processors(config, dataset_stats=stats())
+    pre, post = make_pre_post_processors(config, dataset_stats=make_statistics())
     pre.save_pretrained(tmp_path)
     post.save_pretrained(tmp_path)
     loaded, _ = make_pre_post_processors(config, pretrained_path=str(tmp_path))
@@ -98,7 +91,7 @@ def test_a_cloud_in_sampling_order_keeps_its_first_points(n_points):
     "dtype", [torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.uint8, torch.bool]
 )
 def test_every_dtype_becomes_float32_and_the_statistics_stay(dtype):
-    pre, _ = make_pre_post_processors(make_config(), dataset_stats=stats())
+    pre, _ = make_pre_post_processors(make_config(), dataset_stats=make_statistics())
     values = {
         OBS_POINT_CLOUD: torch.ones(2, 2, N_POINTS, 3),
         STATE: torch.ones(2, 2, N_STATES),

@@ -12,7 +12,16 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config, make_observation, overfit
+from tests.builders import (
+    N_ACTIONS,
+    N_POINTS,
+    N_STATES,
+    make_batch,
+    make_config,
+    make_observation,
+    make_statistics,
+    overfit,
+)
 from torch import nn
 
 from lerobot_uca.errors import UserError
@@ -34,7 +43,7 @@ def history(*observations: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 def test_lerobot_finds_config_policy_and_processors():
     assert isinstance(make_policy_config("uca_flow", device="cpu"), UCAFlowConfig)
     assert get_policy_class("uca_flow") is UCAFlowPolicy
-    pre, post = make_pre_post_processors(make_config())
+    pre, post = make_pre_post_processors(make_config(), dataset_stats=make_statistics())
     names = [step._registry_name for step in (*pre.steps, *post.steps)]
     assert set(names) >= {  # training and evaluation override these by name
         "rename_observations_processor",

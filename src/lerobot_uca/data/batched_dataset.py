@@ -81,7 +81,7 @@ class BatchedDataset(LeRobotDataset):
 
     def __getitems__(self, indices: Sequence[int]) -> list[Any]:
         """Samples of a batch of indices, equal to [self[i] for i in indices]."""
-        columns = self._columns()
+        columns = self.columns()
         if columns is None:
             return [self[int(index)] for index in indices]
         return columns.samples(self._ensure_reader(), indices)
@@ -89,7 +89,7 @@ class BatchedDataset(LeRobotDataset):
     @override
     def __getstate__(self) -> dict[str, Any]:
         """Decode before the dataset is sent to a DataLoader's workers: PyTorch lets them share the tensors' memory."""
-        self._columns()
+        self.columns()
         return self.__dict__.copy()
 
     @property
@@ -107,8 +107,8 @@ class BatchedDataset(LeRobotDataset):
                 return False
         return n_bytes * self.num_frames <= MAX_BYTES
 
-    def _columns(self) -> Columns | None:
-        """The decoded columns, made at the first call, or None if the dataset must be read as before."""
+    def columns(self) -> Columns | None:
+        """All rows of the chosen episodes, made at the first call, or None if the dataset must be read as before."""
         if not self.is_batched:
             return None
         reader = self._ensure_reader()

@@ -1,5 +1,6 @@
 """Configuration shared by the point-cloud policies: observations, horizons, encoder, training recipe."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -133,14 +134,20 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         }
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
-        """Take note of how a dataset's clouds are made; of depth images, make them. LeRobot calls it before training.
+        """Take note of how a dataset's clouds are made, and of how many points; of depth images, make them.
+
+        LeRobot calls it before training. It would keep the number of points of a checkpoint that is trained further.
 
         Raises:
             UserError: if depth images lack a calibration or a crop, or do not fit the checkpoint to be trained further.
         """
         knows_clouds = self.depth.recipe is not None
         recipe = self.depth.settle(features)
-        if recipe is None or find_point_cloud(features) is not None:
+        cloud_key = find_point_cloud(features)
+        if cloud_key is not None and OBS_POINT_CLOUD in (self.input_features or {}):
+            cloud = PolicyFeature(FeatureType.STATE, (features[cloud_key]["shape"][0], 3))
+            self.input_features = {**(self.input_features or {}), OBS_POINT_CLOUD: cloud}
+        if recipe is None or cloud_key is not None:
             return
         if self.pretrained_path and not knows_clouds:
             raise UserError(
@@ -149,6 +156,25 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             )
         inputs = {key: feature for key, feature in (self.input_features or {}).items() if key not in recipe.keys}
         self.input_features = {**inputs, OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (recipe.n_points, 3))}
+
+    def check_dataset(self, features: Mapping[str, Mapping[str, Any]]) -> None:
+        """Raise a `UserError` if a dataset's features, already renamed, cannot continue this checkpoint's training."""
+        before = {**(self.input_features or {}), **(self.output_features or {})}
+        cloud_key = find_point_cloud(features)
+        known = {**features, **({OBS_POINT_CLOUD: features[cloud_key]} if cloud_key else {})}
+        for key in before.keys() & {OBS_POINT_CLOUD, OBS_STATE, ACTION}:
+            if key == OBS_POINT_CLOUD and self.depth.recipe is not None:
+                continue  # made from depth images
+            if key not in known:
+                raise UserError(
+                    f"The checkpoint needs '{key}', which is not among the dataset's features {', '.join(features)}. "
+                    f"""--rename_map='{{"name": "{key}"}}' renames one."""
+                )
+            shape = tuple(known[key]["shape"])
+            if key != OBS_POINT_CLOUD and shape != tuple(before[key].shape):
+                raise UserError(
+                    f"'{key}' must have the checkpoint's shape {tuple(before[key].shape)}, got {shape} in the dataset."
+                )
 
     @property
     def n_states(self) -> int:

@@ -4,21 +4,30 @@ Letters: B samples, O observation steps, N points, S state dimensions, T horizon
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, override
 
 import torch
 from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, PolicyAction, TransitionKey
-from lerobot.processor import PolicyProcessorPipeline, ProcessorStep, ProcessorStepRegistry
+from lerobot.processor import (
+    NormalizerProcessorStep,
+    PolicyProcessorPipeline,
+    ProcessorStep,
+    ProcessorStepRegistry,
+    RenameObservationsProcessorStep,
+    UnnormalizerProcessorStep,
+)
 from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, VALID_MASK_SUFFIX, find_point_cloud
+from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud, valid_mask
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
+from lerobot_uca.policies.statistics import check_statistics, settled_statistics
 
 logger = logging.getLogger(__name__)
 
@@ -28,13 +37,17 @@ Processors = tuple[
 
 
 def make_processors(
-    config: PointCloudPolicyConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
+    config: PointCloudPolicyConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> Processors:
     """LeRobot's pipelines (rename, batch, device, normalise; and back), with a uniform point cloud before the batch.
 
     Where there are depth images, the cloud is made from them.
+
+    Raises:
+        UserError: as `settled_statistics`.
     """
-    steps = make_default_policy_processor_steps(config, dataset_stats)
+    config.validate_features()
+    steps = make_default_policy_processor_steps(config, settled_statistics(dataset_stats, config))
     return make_policy_processor_pipelines(
         [
             steps.rename_observations,
@@ -46,6 +59,63 @@ def make_processors(
         ],
         [steps.unnormalize, steps.to_cpu],
     )
+
+
+def load_processors(
+    make: Callable[..., Processors], config: PointCloudPolicyConfig, checkpoint: str, *args: Any, **options: Any
+) -> Processors:
+    """A checkpoint's pipelines: settled statistics in, checked pipelines out.
+
+    LeRobot passes a feature on as it is if its normaliser does not know it.
+
+    Args:
+        make: LeRobot's `make_pre_post_processors`.
+        config: of the policy.
+        checkpoint: where the pipelines are saved.
+        args, options: LeRobot's.
+
+    Raises:
+        UserError: if they would let something pass unnormalised, and as `settled_statistics`.
+    """
+    config.validate_features()
+    before = {key: dict(each) for key, each in (options.pop("preprocessor_overrides", None) or {}).items()}
+    after = {key: dict(each) for key, each in (options.pop("postprocessor_overrides", None) or {}).items()}
+    before.setdefault("device_processor", {"device": config.device})  # the saved one may be another machine's
+    if "stats" in before.get("normalizer_processor", {}):
+        rename_map = before.get("rename_observations_processor", {}).get("rename_map")
+        stats = settled_statistics(before["normalizer_processor"]["stats"], config, rename_map)
+        before["normalizer_processor"]["stats"] = stats
+        after.setdefault("unnormalizer_processor", {})["stats"] = stats
+    overrides = {"preprocessor_overrides": before, "postprocessor_overrides": after}
+    processors = make(config, checkpoint, *args, **options, **overrides)
+    _check_pipelines(config, checkpoint, *processors)
+    return processors
+
+
+def _check_pipelines(
+    config: PointCloudPolicyConfig, checkpoint: str, pre: PolicyProcessorPipeline, post: PolicyProcessorPipeline
+) -> None:
+    """Nothing may reach the policy or the robot unnormalised; old checkpoints get the point-cloud step."""
+    for pipeline, kind, keys in (
+        (pre, NormalizerProcessorStep, (OBS_POINT_CLOUD, OBS_STATE, ACTION)),
+        (post, UnnormalizerProcessorStep, (ACTION,)),
+    ):
+        step = next((each for each in pipeline.steps if isinstance(each, kind)), None)
+        if step is None:
+            raise UserError(f"'{pipeline.name}' of checkpoint '{checkpoint}' has no {kind._registry_name}.")
+        for key in keys:
+            if key not in step.features:
+                raise UserError(f"The {kind._registry_name} of checkpoint '{checkpoint}' does not know '{key}'.")
+            stats = {name.rpartition("."): value for name, value in step.state_dict().items()}
+            stats = {name: value for (of, _, name), value in stats.items() if of == key}
+            check_statistics(key, stats, config, where=f"the {kind._registry_name}'s in '{checkpoint}'")
+    clouds = [each for each in pre.steps if isinstance(each, PointCloudProcessorStep)]
+    if clouds:
+        clouds[0].n_points = config.n_points
+    else:
+        renames = [isinstance(each, RenameObservationsProcessorStep) for each in pre.steps]
+        pre.steps = [*pre.steps]
+        pre.steps.insert(renames.index(True) + 1 if True in renames else 0, PointCloudProcessorStep(config.n_points))
 
 
 @dataclass
@@ -81,9 +151,9 @@ class PointCloudProcessorStep(ProcessorStep):
             self._has_said = True
             shape = tuple(cloud.shape[-2:])
             logger.warning("'%s' %s: its first three channels are taken as the point cloud's xyz.", key, shape)
-        mask = observation.pop(key.removesuffix(".xyz") + VALID_MASK_SUFFIX, None)
-        if mask is not None:
-            cloud = _with_valid_points(cloud, torch.as_tensor(mask).bool())
+        mask_key = valid_mask(key, observation)
+        if mask_key is not None:
+            cloud = _with_valid_points(cloud, torch.as_tensor(observation.pop(mask_key)).bool())
         observation[OBS_POINT_CLOUD] = self._sampled(cloud[..., :3])
         transition = transition.copy()
         if OBS_STATE in observation:

@@ -1,0 +1,294 @@
+"""Training, fine-tuning and loading: the right statistics reach LeRobot's normalisers, or a line says why not."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.scripts import lerobot_train
+from safetensors.torch import load_file, save_file
+
+from lerobot_uca.deploy.export import RawPolicy
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
+from lerobot_uca.policies.processor_base import PointCloudProcessorStep
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, SMALL_POLICIES, write_dataset
+
+STATE, ACTION = "observation.state", "action"
+STATISTICS = "policy_preprocessor_step_5_normalizer_processor.safetensors"
+
+
+def features(cloud: str = OBS_POINT_CLOUD, n_points: int = N_POINTS, channels: int = 3, dtype: str = "float32") -> dict:
+    return {
+        cloud: {"dtype": "float32", "shape": (n_points, channels), "names": None},
+        STATE: {"dtype": dtype, "shape": (N_STATES,), "names": None},
+        ACTION: {"dtype": dtype, "shape": (N_ACTIONS,), "names": None},
+    }
+
+
+def train(root: Path, output: Path, checkpoint: Path | None = None, dataset: dict | None = None, **options) -> Path:
+    """One step of training, as lerobot-train does it. Returns its checkpoint."""
+    if checkpoint is None:
+        policy = UCAFlowConfig(
+            device="cpu", push_to_hub=False, **SMALL_POLICIES["uca_flow"], **options.pop("policy", {})
+        )
+    else:
+        policy = PreTrainedConfig.from_pretrained(checkpoint)
+        policy.pretrained_path = checkpoint
+    config = TrainPipelineConfig(
+        dataset=DatasetConfig(repo_id="test/random", root=str(root), **(dataset or {})),
+        policy=policy,
+        output_dir=output,
+        steps=1,
+        batch_size=4,
+        num_workers=0,
+        env_eval_freq=0,
+        **options,
+    )
+    lerobot_train.train(config)
+    return output / "checkpoints" / "last" / "pretrained_model"
+
+
+def load(checkpoint: Path):
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config).eval()
+    return policy, *make_pre_post_processors(config, pretrained_path=str(checkpoint))
+
+
+def saved(checkpoint: Path) -> dict[str, torch.Tensor]:
+    return load_file(checkpoint / STATISTICS)
+
+
+def columns(root: Path, key: str, episodes: list[int] | None = None) -> np.ndarray:
+    dataset = LeRobotDataset("test/random", root=root)
+    rows = [row for row in dataset.hf_dataset if episodes is None or int(row["episode_index"]) in episodes]
+    return np.stack([np.asarray(row[key]) for row in rows])
+
+
+@pytest.fixture(scope="module")
+def checkpoint(dataset_root, tmp_path_factory) -> Path:
+    return train(dataset_root, tmp_path_factory.mktemp("train") / "new")
+
+
+@pytest.fixture
+def damaged(checkpoint, tmp_path) -> Path:
+    return shutil.copytree(checkpoint, tmp_path / "damaged")
+
+
+# Statistics ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", ["int64", "int32", "uint8", "bool"])
+def test_every_dtype_has_right_statistics_in_its_checkpoint(tmp_path, dtype):
+    write_dataset(tmp_path / "data", features=features(dtype=dtype))
+    stats = saved(train(tmp_path / "data", tmp_path / "new"))
+    for key in (STATE, ACTION):
+        values = columns(tmp_path / "data", key).astype(np.float64)
+        np.testing.assert_allclose(stats[f"{key}.min"], values.min(axis=0), atol=1e-6)
+        np.testing.assert_allclose(stats[f"{key}.max"], values.max(axis=0), atol=1e-6)
+        np.testing.assert_allclose(stats[f"{key}.mean"], values.mean(axis=0), atol=1e-5)
+
+
+def test_a_constant_dimension_in_training_and_fine_tuning(dataset_root, checkpoint, tmp_path):
+    def hold(frame, *_):
+        frame[ACTION][3] = 0.5
+
+    write_dataset(tmp_path / "data", change=hold)
+    for trained in (
+        train(tmp_path / "data", tmp_path / "new"),
+        train(tmp_path / "data", tmp_path / "fine", checkpoint=checkpoint),
+    ):
+        _, pre, post = load(trained)
+        normalised = pre({**next(batches(tmp_path / "data"))})[ACTION]
+        assert torch.equal(normalised[:, 3], torch.zeros(len(normalised)))
+        torch.testing.assert_close(post(torch.zeros(1, N_ACTIONS))[0, 3].item(), 0.5)
+
+
+def batches(root: Path):
+    dataset = LeRobotDataset("test/random", root=root)
+    rows = [dataset[index] for index in range(3)]
+    yield {key: torch.stack([row[key] for row in rows]) for key in (OBS_POINT_CLOUD, STATE, ACTION)}
+
+
+def test_statistics_of_the_chosen_episodes(dataset_root, tmp_path):
+    stats = saved(train(dataset_root, tmp_path / "new", dataset={"episodes": [0, 2]}))
+    np.testing.assert_allclose(stats[f"{STATE}.min"], columns(dataset_root, STATE, [0, 2]).min(axis=0), rtol=1e-6)
+
+
+def test_held_out_episodes_do_not_count(dataset_root, tmp_path):
+    stats = saved(train(dataset_root, tmp_path / "new", dataset={"eval_split": 0.3}))
+    # The last episode of each task is held out; of two tasks with episodes 0, 2 and 1 is left episode 0.
+    np.testing.assert_allclose(stats[f"{STATE}.max"], columns(dataset_root, STATE, [0]).max(axis=0), rtol=1e-6)
+
+
+def test_leaving_out_the_episode_with_a_nan_trains(tmp_path):
+    def spoil(frame, episode, index):
+        if (episode, index) == (1, 4):
+            frame[OBS_POINT_CLOUD][3, 1] = np.nan
+
+    write_dataset(tmp_path / "data", change=spoil)
+    with pytest.raises(UserError, match=r"values NaN or infinite in episode 1, frame 4. --dataset.episodes=\[0,2\]"):
+        train(tmp_path / "data", tmp_path / "all")
+    stats = saved(train(tmp_path / "data", tmp_path / "new", dataset={"episodes": [0, 2]}))
+    assert all(torch.isfinite(value).all() for value in stats.values())
+
+
+# Clouds -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("cloud", "channels"), [("observation.pointcloud", 6), ("observation.pointcloud.xyz", 3)])
+def test_clouds_of_other_plugins_train_and_act(tmp_path, cloud, channels):
+    write_dataset(tmp_path / "data", features=features(cloud, channels=channels))
+    trained = train(tmp_path / "data", tmp_path / "new")
+    xyz = columns(tmp_path / "data", cloud)[..., :3]
+    np.testing.assert_allclose(saved(trained)[f"{OBS_POINT_CLOUD}.max"], xyz.max(axis=(0, 1)), rtol=1e-6)
+    policy, pre, post = load(trained)
+    frame = LeRobotDataset("test/random", root=tmp_path / "data")[0]
+    assert post(policy.select_action(pre(frame))).shape == (1, N_ACTIONS)
+    assert RawPolicy(str(trained)).input_shapes["point_cloud"] == (2, N_POINTS, 3)
+
+
+def test_invalid_points_count_nowhere(tmp_path):
+    def mask(frame, *_):
+        frame["observation.pointcloud.valid_mask"][:] = True
+        frame["observation.pointcloud.valid_mask"][5:9] = False
+        frame["observation.pointcloud.xyz"][5:9] = np.nan
+
+    of_mask = {"dtype": "bool", "shape": (N_POINTS,), "names": None}
+    both = {**features("observation.pointcloud.xyz"), "observation.pointcloud.valid_mask": of_mask}
+    write_dataset(tmp_path / "data", features=both, change=mask)
+    trained = train(tmp_path / "data", tmp_path / "new")
+    xyz = columns(tmp_path / "data", "observation.pointcloud.xyz")
+    np.testing.assert_allclose(saved(trained)[f"{OBS_POINT_CLOUD}.min"], np.nanmin(xyz, axis=(0, 1)), rtol=1e-6)
+    policy, pre, _ = load(trained)
+    assert policy.select_action(pre(LeRobotDataset("test/random", root=tmp_path / "data")[0])).isfinite().all()
+
+
+def test_fine_tuning_under_other_names_and_with_more_points(checkpoint, tmp_path):
+    write_dataset(tmp_path / "data", features=features("observation.scan", n_points=64))
+    rename = {"observation.scan": OBS_POINT_CLOUD}
+    trained = train(tmp_path / "data", tmp_path / "new", checkpoint=checkpoint, rename_map=rename)
+    scan = columns(tmp_path / "data", "observation.scan")
+    np.testing.assert_allclose(saved(trained)[f"{OBS_POINT_CLOUD}.max"], scan.max(axis=(0, 1)), rtol=1e-6)
+    assert RawPolicy(str(trained)).input_shapes["point_cloud"] == (2, 64, 3)
+
+
+def test_fine_tuning_without_the_cloud_the_checkpoint_knows(checkpoint, tmp_path):
+    write_dataset(tmp_path / "data", features=features("observation.scan"))
+    with pytest.raises(
+        UserError, match=f"needs '{OBS_POINT_CLOUD}', which is not among .*observation.scan.*rename_map"
+    ):
+        train(tmp_path / "data", tmp_path / "new", checkpoint=checkpoint)
+
+
+def test_fine_tuning_with_another_robot(checkpoint, tmp_path):
+    other = {**features(), STATE: {"dtype": "float32", "shape": (7,), "names": None}}
+    write_dataset(tmp_path / "data", features=other)
+    with pytest.raises(UserError, match=r"'observation.state' must have the checkpoint's shape \(9,\), got \(7,\)"):
+        train(tmp_path / "data", tmp_path / "new", checkpoint=checkpoint)
+
+
+def test_a_state_and_an_action_of_one_dimension(tmp_path):
+    one = {"dtype": "float32", "shape": (1,), "names": None}
+    write_dataset(tmp_path / "data", features={**features(), STATE: one, ACTION: one})
+    policy, pre, post = load(train(tmp_path / "data", tmp_path / "new"))
+    frame = LeRobotDataset("test/random", root=tmp_path / "data")[0]
+    assert post(policy.select_action(pre(frame))).shape == (1, 1)
+
+
+# Loading ------------------------------------------------------------------------------------------------------------
+
+
+def test_an_old_checkpoint_gets_the_point_cloud_step(damaged):
+    pipeline = damaged / "policy_preprocessor.json"
+    settings = json.loads(pipeline.read_text())
+    settings["steps"] = [step for step in settings["steps"] if step["registry_name"] != "point_cloud_processor"]
+    pipeline.write_text(json.dumps(settings))
+    _, pre, _ = load(damaged)
+    assert any(isinstance(step, PointCloudProcessorStep) for step in pre.steps)
+
+
+def test_a_checkpoint_of_a_machine_with_a_gpu_falls_back(damaged, caplog):
+    for name in ("config.json", "policy_preprocessor.json"):
+        file = damaged / name
+        file.write_text(file.read_text().replace('"cpu"', '"cuda"'))
+    policy, pre, _ = load(damaged)
+    available = "cuda" if torch.cuda.is_available() else "cpu"
+    assert policy.config.device == available
+    assert (
+        pre({OBS_POINT_CLOUD: torch.zeros(1, N_POINTS, 3), STATE: torch.zeros(1, N_STATES)})[STATE].device.type
+        == available
+    )
+    assert torch.cuda.is_available() or "Device 'cuda' is not available" in caplog.text
+
+
+@pytest.mark.parametrize("step", ["normalizer_processor", "device_processor"])
+def test_a_step_is_missing(damaged, step):
+    pipeline = damaged / "policy_preprocessor.json"
+    settings = json.loads(pipeline.read_text())
+    settings["steps"] = [each for each in settings["steps"] if each["registry_name"] != step]
+    pipeline.write_text(json.dumps(settings))
+    with pytest.raises(UserError, match=step):
+        load(damaged)
+
+
+def test_the_postprocessor_does_not_bring_actions_back(damaged):
+    pipeline = damaged / "policy_postprocessor.json"
+    settings = json.loads(pipeline.read_text())
+    settings["steps"] = settings["steps"][1:]
+    pipeline.write_text(json.dumps(settings))
+    with pytest.raises(UserError, match=r"'policy_postprocessor' of checkpoint .* has no unnormalizer_processor"):
+        load(damaged)
+
+
+@pytest.mark.parametrize("key", [OBS_POINT_CLOUD, STATE, ACTION])
+def test_the_normaliser_does_not_know_a_feature(damaged, key):
+    stats = load_file(damaged / STATISTICS)
+    save_file({name: value for name, value in stats.items() if not name.startswith(key)}, damaged / STATISTICS)
+    with pytest.raises(UserError, match=f"needs 'min' of '{key}', which is not among the normalizer_processor's"):
+        load(damaged)
+
+
+def test_an_emptied_file_of_statistics(damaged):
+    save_file({}, damaged / STATISTICS)
+    with pytest.raises(UserError, match="which is not among the normalizer_processor's"):
+        load(damaged)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no tensors"])
+def test_a_broken_file_of_statistics(damaged, content):
+    (damaged / STATISTICS).unlink() if content is None else (damaged / STATISTICS).write_bytes(content)
+    with pytest.raises(UserError, match=r"The processors of .* cannot be loaded"):
+        load(damaged)
+
+
+def test_a_normaliser_without_features(damaged):
+    pipeline = damaged / "policy_preprocessor.json"
+    settings = json.loads(pipeline.read_text())
+    settings["steps"][-1]["config"]["features"] = {}
+    pipeline.write_text(json.dumps(settings))
+    with pytest.raises(UserError, match=r"normalizer_processor of checkpoint .* does not know"):
+        load(damaged)
+
+
+@pytest.mark.parametrize("damage", ["file", "feature"])
+def test_a_dataset_without_statistics(dataset_root, tmp_path, damage):
+    root = shutil.copytree(dataset_root, tmp_path / "data")
+    file = root / "meta" / "stats.json"
+    stats = json.loads(file.read_text())
+    file.unlink()
+    if damage == "feature":
+        del stats[STATE]
+        file.write_text(json.dumps(stats))
+    with pytest.raises(
+        UserError, match=r"meta/stats.json is missing" if damage == "file" else f"needs 'min' of '{STATE}'"
+    ):
+        train(root, tmp_path / "new")
