@@ -15,6 +15,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
+from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.deploy.export import RawPolicy
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
@@ -34,18 +35,24 @@ def features(cloud: str = OBS_POINT_CLOUD, n_points: int = N_POINTS, channels: i
     }
 
 
-def train(root: Path, output: Path, checkpoint: Path | None = None, dataset: dict | None = None, **options) -> Path:
+def train(
+    root: Path,
+    output: Path,
+    checkpoint: Path | None = None,
+    dataset: dict | None = None,
+    policy: dict | None = None,
+    **options: object,
+) -> Path:
     """One step of training, as lerobot-train does it. Returns its checkpoint."""
     if checkpoint is None:
-        policy = UCAFlowConfig(
-            device="cpu", push_to_hub=False, **SMALL_POLICIES["uca_flow"], **options.pop("policy", {})
-        )
+        settings = SMALL_POLICIES["uca_flow"] | (policy or {})
+        of_policy = UCAFlowConfig(device="cpu", push_to_hub=False, **settings)
     else:
-        policy = PreTrainedConfig.from_pretrained(checkpoint)
-        policy.pretrained_path = checkpoint
+        of_policy = PreTrainedConfig.from_pretrained(checkpoint)
+        of_policy.pretrained_path = checkpoint
     config = TrainPipelineConfig(
         dataset=DatasetConfig(repo_id="test/random", root=str(root), **(dataset or {})),
-        policy=policy,
+        policy=of_policy,
         output_dir=output,
         steps=1,
         batch_size=4,
@@ -202,6 +209,20 @@ def test_a_state_and_an_action_of_one_dimension(tmp_path):
     policy, pre, post = load(train(tmp_path / "data", tmp_path / "new"))
     frame = LeRobotDataset("test/random", root=tmp_path / "data")[0]
     assert post(policy.select_action(pre(frame))).shape == (1, 1)
+
+
+def test_fewer_points_are_sampled_once_and_alike_in_training_and_control(dataset_root, tmp_path, monkeypatch):
+    seen = []
+    read = BatchedDataset.__getitems__
+    monkeypatch.setattr(BatchedDataset, "__getitems__", lambda self, rows: seen.append(read(self, rows)) or seen[-1])
+    trained = train(dataset_root, tmp_path / "new", policy={"n_points": 10})
+    sample = seen[0][0]
+    assert sample[OBS_POINT_CLOUD].shape == (2, 10, 3)
+    policy, pre, _ = load(trained)
+    frame = LeRobotDataset("test/random", root=dataset_root)[int(sample["index"])]
+    of_training = pre({OBS_POINT_CLOUD: sample[OBS_POINT_CLOUD][-1:], STATE: frame[STATE][None]})
+    assert torch.equal(pre(frame)[OBS_POINT_CLOUD], of_training[OBS_POINT_CLOUD])
+    assert policy.select_action(pre(frame)).shape == (1, N_ACTIONS)
 
 
 # Loading ------------------------------------------------------------------------------------------------------------

@@ -74,6 +74,7 @@ def test_only_our_console_commands_are_installed():
         "lerobot-uca-calibrate",
         "lerobot-uca-collect",
         "lerobot-uca-convert",
+        "lerobot-uca-edit-dataset",
         "lerobot-uca-export",
         "lerobot-uca-saliency",
         "lerobot-uca-ur5e-sim",

@@ -56,6 +56,14 @@ def calibrate() -> None:
     run()
 
 
+def edit_dataset() -> None:
+    """`lerobot-uca-edit-dataset`."""
+    end_by_signals()
+    from lerobot_uca.data.edit_dataset import run
+
+    run()
+
+
 def benchmark() -> None:
     """`lerobot-uca-benchmark`."""
     from lerobot_uca.errors import UserError

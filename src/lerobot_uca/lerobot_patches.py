@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any
 
 import lerobot
+import torch
 import yaml
 from lerobot.common import train_utils
 from lerobot.configs import PreTrainedConfig, parser
@@ -25,6 +26,7 @@ from lerobot.processor import DataProcessorPipeline
 from lerobot.utils import utils
 from lerobot.utils.constants import ACTION, OBS_STATE
 from packaging.version import Version
+from tqdm import tqdm
 
 from lerobot_uca import configs
 from lerobot_uca.checkpoints.resuming import cycle_exactly, without_trace
@@ -33,14 +35,15 @@ from lerobot_uca.checkpoints.steps import check_steps
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
 from lerobot_uca.errors import UserError, reported
-from lerobot_uca.features import find_point_cloud, valid_mask
+from lerobot_uca.features import ENV_NAMES, find_point_cloud, valid_mask
 from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
-from lerobot_uca.policies.processor_base import load_processors
+from lerobot_uca.policies.processor_base import PointCloudProcessorStep, load_processors
 from lerobot_uca.policies.publishing import Evaluation, PublishedPolicy
 from lerobot_uca.processes import end_by_signals
 
 SUPPORTED_LEROBOT = "0.6.1"
+EVALUATION_MODULES = ("lerobot.scripts.lerobot_eval", "__main__")
 
 USED_NAMES = (
     # Private names and functions without a promise, by module: a port to another LeRobot starts here.
@@ -90,6 +93,7 @@ def install() -> None:
     resume_exactly()
     report_failed_uploads()
     normalise_what_is_trained()
+    record_what_can_be_trained()
 
 
 def report_user_errors() -> None:
@@ -353,8 +357,49 @@ def _normalise_by_chosen_episodes(policy: PointCloudPolicyConfig, dataset: Any, 
     used = {find_point_cloud(renamed), OBS_STATE, ACTION} & renamed.keys()
     masks = {key_of[name]: key_of.get(valid_mask(name, renamed) or "") for name in used if name}
     check_finite(dataset, masks)
+    cloud_name = find_point_cloud(renamed)
+    if policy.n_points is not None and cloud_name is not None and isinstance(dataset, BatchedDataset):
+        _sample_clouds(policy.n_points, dataset, key_of[cloud_name])
     if dataset.meta.stats:
         dataset.meta.stats = {**dataset.meta.stats, **chosen_statistics(dataset, masks)}
+
+
+def _sample_clouds(n_points: int, dataset: BatchedDataset, key: str) -> None:
+    """Sample all clouds once: the processor's step would sample them again in every epoch."""
+    columns = dataset.columns()
+    if columns is None or columns.tensors[key].shape[1] <= n_points:
+        return
+    step = PointCloudProcessorStep(n_points)
+    mask = columns.tensors.pop(valid_mask(key, columns.tensors) or "", None)
+    clouds = columns.tensors[key]
+    rows = tqdm(range(len(clouds)), desc=f"Sampling {n_points} of {clouds.shape[1]} points", unit="cloud")
+    sampled = [step.uniform(clouds[row].float(), None if mask is None else mask[row]) for row in rows]
+    columns.tensors[key] = torch.stack(sampled)
+
+
+def record_what_can_be_trained() -> None:
+    """`lerobot-eval --eval.recording=true` names features as policies do. LeRobot takes the environment's names.
+
+    With those (point_cloud, agent_pos) nothing can be trained, and nothing renames them.
+    """
+    evaluation = next((sys.modules[name] for name in EVALUATION_MODULES if name in sys.modules), None)
+    if evaluation is None or not hasattr(evaluation, "_build_raw_frame"):  # no evaluation in this process
+        return
+
+    def features(make: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda env_features: _renamed(make(env_features))
+
+    def frame(build: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda raw_obs, *args, **kwargs: build(_renamed(raw_obs), *args, **kwargs)
+
+    _replace(evaluation._env_features_to_dataset_features, features)
+    _replace(evaluation._build_raw_frame, frame)
+
+
+def _renamed(values: dict[str, Any]) -> dict[str, Any]:
+    """Observations or features of this package's environments under the policies' names; others' as they are."""
+    is_ours = values.keys() >= ENV_NAMES.keys()
+    return {ENV_NAMES.get(key, key) if is_ours else key: value for key, value in values.items()}
 
 
 def _read_without_workers(config: TrainPipelineConfig, dataset: Any) -> None:

@@ -1,8 +1,13 @@
 """Batched reading gives what stock reading gives, bit for bit and key for key."""
 
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.datasets import EpisodeAwareSampler, compute_sampler_state
@@ -12,6 +17,7 @@ from torch.utils.data import DataLoader, Subset, default_collate
 
 from lerobot_uca.data import batched_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
+from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 
 WINDOWS = {
@@ -166,3 +172,33 @@ def test_other_number_types_keep_their_values(tmp_path):
     dataset = open_dataset(tmp_path / "d", delta_timestamps={"observation.grid": [-1 / 80, 0]})
     for index in (0, 5, len(dataset) - 1):
         assert_equal_batches(dataset.__getitems__([index])[0], dataset[index])
+
+
+# Datasets that are not whole -----------------------------------------------------------------------------------------
+
+
+def rewrite(root: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    for file in (root / "data").glob("**/*.parquet"):
+        pq.write_table(change(pq.read_table(file)), file)
+
+
+def test_a_missing_column_is_named(dataset_root, tmp_path):
+    root = shutil.copytree(dataset_root, tmp_path / "data")
+    rewrite(root, lambda table: table.drop_columns(["observation.state"]))
+    with pytest.raises(UserError, match=r"'observation.state' must have a value in each row"):
+        open_dataset(root).__getitems__([0])
+
+
+@pytest.mark.parametrize(
+    ("change", "row"),
+    [
+        (lambda table: table.take([1, 0, *range(2, len(table))]), 0),
+        (lambda table: table.take([*range(5), *range(6, len(table))]), 5),
+        (lambda table: table.slice(0, len(table) - 1), 38),
+    ],
+)
+def test_rows_out_of_order_and_missing_rows_are_refused(dataset_root, tmp_path, change, row):
+    root = shutil.copytree(dataset_root, tmp_path / "data")
+    rewrite(root, change)
+    with pytest.raises(UserError, match=f"must be in the order of their index, .* row {row} is another one"):
+        open_dataset(root).__getitems__([0])

@@ -16,7 +16,7 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
-from lerobot_uca.errors import reported
+from lerobot_uca.errors import UserError, reported
 
 MAX_BYTES = 4 * 2**30
 """Datasets whose decoded columns would be larger are read as before."""
@@ -35,13 +35,33 @@ class Columns:
         table = reader.hf_dataset.with_format("arrow")[:]
         example = reader.hf_dataset[0]
         self.source = reader.hf_dataset
+        for key in example:
+            if table.column(key).null_count:
+                raise UserError(
+                    f"'{key}' must have a value in each row of the dataset's Parquet files, got none in some."
+                )
         self.tensors = {key: _decode(table.column(key), example[key]) for key in example}
         self.tasks = list(reader._meta.tasks.index)
         episodes = reader._meta.episodes
         self.episode_start = torch.tensor(episodes["dataset_from_index"])
         self.episode_end = torch.tensor(episodes["dataset_to_index"])
+        self._check_order()
         self.row_of_frame = torch.full((int(self.episode_end.max()),), -1)
         self.row_of_frame[self.tensors["index"]] = torch.arange(len(self.tensors["index"]))
+
+    def _check_order(self) -> None:
+        """Stock reading takes the rows as they are, this one by their index: they must be in its order."""
+        index = self.tensors["index"]
+        episodes = self.tensors["episode_index"].unique().tolist()
+        start, end = self.episode_start.tolist(), self.episode_end.tolist()
+        expected = torch.cat([torch.arange(start[each], end[each]) for each in episodes])
+        if not torch.equal(index, expected):
+            n_same = min(len(index), len(expected))
+            row = [*(index[:n_same] != expected[:n_same]).nonzero().flatten().tolist(), n_same][0]
+            raise UserError(
+                f"The dataset's rows must be in the order of their index, one for each frame of their episodes; "
+                f"row {row} is another one."
+            )
 
     def samples(self, reader: DatasetReader, rows: Sequence[int]) -> list[Sample]:
         """The same as `reader.get_item` for each row."""

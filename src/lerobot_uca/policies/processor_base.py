@@ -152,9 +152,8 @@ class PointCloudProcessorStep(ProcessorStep):
             shape = tuple(cloud.shape[-2:])
             logger.warning("'%s' %s: its first three channels are taken as the point cloud's xyz.", key, shape)
         mask_key = valid_mask(key, observation)
-        if mask_key is not None:
-            cloud = _with_valid_points(cloud, torch.as_tensor(observation.pop(mask_key)).bool())
-        observation[OBS_POINT_CLOUD] = self._sampled(cloud[..., :3])
+        mask = None if mask_key is None else torch.as_tensor(observation.pop(mask_key))
+        observation[OBS_POINT_CLOUD] = self.uniform(cloud, mask)
         transition = transition.copy()
         if OBS_STATE in observation:
             observation[OBS_STATE] = _with_last_dimension(_as_float(observation[OBS_STATE]), cloud)
@@ -164,9 +163,15 @@ class PointCloudProcessorStep(ProcessorStep):
         transition[TransitionKey.OBSERVATION] = observation
         return _with_batch(transition) if _is_single(transition) else transition
 
-    def _sampled(self, cloud: Tensor) -> Tensor:
-        """(..., N, 3) to (..., n_points, 3)."""
+    def uniform(self, cloud: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Valid points' xyz, (..., N, 3) or of more points (..., n_points, 3), of clouds (..., N, C).
+
+        Args:
+            cloud: float32, xyz in the first of its C channels.
+            mask: which points are valid, (..., N); None for all.
+        """
         n_points = self.n_points
+        cloud = (cloud if mask is None else _with_valid_points(cloud, mask.bool()))[..., :3]
         if n_points is None or cloud.shape[-2] <= n_points:
             return cloud
         from lerobot_uca.point_clouds.geometry import subsample_farthest
