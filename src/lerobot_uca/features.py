@@ -5,9 +5,9 @@ from collections.abc import Iterable
 OBS_POINT_CLOUD = "observation.point_cloud"
 """(N, 3) float32 [m], in the frame that the environment or robot states."""
 
-
 ENV_NAMES = {"point_cloud": OBS_POINT_CLOUD, "agent_pos": "observation.state"}
 """The environments' names of their observations, and the policies'."""
+
 POINT_CLOUD_KEYS = (OBS_POINT_CLOUD, "observation.pointcloud", "observation.pointcloud.xyz")
 """Keys under which a point cloud is found, in this order: this package's and other plugins'."""
 
