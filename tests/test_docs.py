@@ -30,16 +30,8 @@ NOT_RUN = {
     "lerobot-uca-benchmark demonstrators": "runs 1850 episodes; tests/protocol/test_demonstrators.py runs two",
 }
 """Beginnings of commands that cannot run here, and why."""
-ELSEWHERE = {
-    "accelerate": "tests/policies/test_distributed.py",
-    "lerobot-record": "tests/robots/ur5e/test_rehearsal.py",
-    "lerobot-replay": "tests/robots/ur5e/test_rehearsal.py",
-    "lerobot-uca-ur5e-sim": "tests/robots/ur5e/test_rehearsal.py",
-    "lerobot-uca-benchmark": "tests/protocol",
-}
-"""Programs that need more than one process or many settings, and the tests that run them."""
 
-# What is added to a command, or overrides it, to make it tiny.
+# Arguments that make a command tiny; they override its own.
 TINY_CLOUD = ["--env.n_points=32"]
 TINY_UCA_FLOW = ["--policy.dim=16", "--policy.n_layers=1", "--policy.n_heads=2", "--policy.n_points=16"]
 TINY_SIMPLE_DP3 = ["--policy.unet_widths=[16,32]", "--policy.point_widths=[16,32]", "--policy.n_points=16"]
@@ -84,9 +76,6 @@ def plain(command: str) -> str:
 
 
 def reason_not_to_run(command: str) -> str | None:
-    program = shlex.split(command)[0]
-    if program in ELSEWHERE:
-        return f"{ELSEWHERE[program]} runs it"
     return next((reason for beginning, reason in NOT_RUN.items() if plain(command).startswith(beginning)), None)
 
 
@@ -141,7 +130,6 @@ def test_a_command_runs(command, workspace, monkeypatch):
 def test_no_reason_is_left_over():
     for beginning in NOT_RUN:
         assert any(plain(command).startswith(beginning) for command in COMMANDS), beginning
-    assert all((ROOT / test).exists() for test in ELSEWHERE.values())
 
 
 def anchor(heading: str) -> str:
@@ -162,6 +150,14 @@ def test_links_lead_to_files_and_headings(page):
         if heading:
             anchors = {anchor(line) for line in re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)}
             assert heading in anchors, f"{page.name}: {link}"
+
+
+def test_every_page_is_listed():
+    """docs/README.md lists each page once, and the README names it."""
+    pages = sorted(page.name for page in PAGES if page.name != "README.md")
+    listed = re.findall(r"^\| \[[^]]*\]\(([^)]+)\)", (ROOT / "docs" / "README.md").read_text(), re.MULTILINE)
+    assert sorted(listed) == pages
+    assert [name for name in pages if f"(docs/{name})" not in (ROOT / "README.md").read_text()] == []
 
 
 def test_the_readme_is_short():
