@@ -98,7 +98,7 @@ def flops(function: Callable[[], Any]) -> int:
 
 
 def n_bytes(network: nn.Module) -> int:
-    """Of the weights."""
+    """The size of the weights."""
     return sum(parameter.nbytes for parameter in network.parameters())
 
 

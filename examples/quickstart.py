@@ -1,4 +1,4 @@
-"""From nothing to an evaluated policy: the public commands, in order, each printed so that it can be repeated.
+"""Make an evaluated policy from nothing: the public commands, in order, each printed so that it can be repeated.
 
 Complete results are reused; remove outputs/quickstart to start over.
 """

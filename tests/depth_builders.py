@@ -39,7 +39,7 @@ def random_depth(camera: Camera, seed: int = 0) -> np.ndarray:
 
 
 def live_frame(seed: int) -> np.ndarray:
-    """What a RealSense camera gives: uint16 millimetres (H, W, 1), with pixels that measure nothing or very far."""
+    """A frame like a RealSense camera's: uint16 mm (H, W, 1), with pixels that measure nothing or very far."""
     frame = np.rint(1e3 * random_depth(make_camera(), seed)).astype(np.uint16)
     frame[::5, ::3], frame[1::7, ::4] = 0, 12000
     return frame[..., None]

@@ -31,7 +31,7 @@ class FakeHub(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_port}"
 
     def files(self, repository: str) -> dict[str, bytes]:
-        """What a repository, such as 'models/user/name', holds: paths and contents."""
+        """The content of a repository, such as 'models/user/name', by path."""
         root = self.folder / repository
         return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 

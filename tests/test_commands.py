@@ -250,7 +250,7 @@ def test_collected_data_opens_as_any_lerobot_dataset(trained):
 
 @pytest.mark.parametrize("name", ["dp3", "simple_dp3", "flowpolicy", "mp1"])
 def test_baselines_are_trained_and_evaluated_by_the_same_commands(name, dataset_root, tmp_path, monkeypatch):
-    """In this process, which has imported everything, and in episodes of 5 steps."""
+    """They run in this process, which has imported everything, and in episodes of 5 steps."""
     monkeypatch.setattr(MetaworldPointCloudEnv, "_max_episode_steps", 5)
     sizes = [f"--policy.{key}={list(size) if isinstance(size, tuple) else size}" for key, size in TINY_UNET.items()]
     common = ["--policy.device=cpu", *ENVIRONMENT, "--eval.n_episodes=1", "--eval.use_async_envs=false"]

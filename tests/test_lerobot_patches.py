@@ -42,7 +42,7 @@ def training(root: Path, output: Path, policy: type = UCAFlowConfig, **options: 
 
 
 def workers(monkeypatch, config: TrainPipelineConfig, *arguments: str) -> int:
-    """What lerobot-train would use: it validates, makes the dataset, then its loader."""
+    """The workers that lerobot-train would use: it validates, makes the dataset, then its loader."""
     monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
     config.validate()
     factory.make_train_eval_datasets(config)
@@ -152,7 +152,7 @@ def test_lerobot_has_what_is_used_of_it(name):
 
 
 def test_every_private_name_is_listed():
-    """Of what is imported from LeRobot; methods are called on its objects by their names."""
+    """The list covers imports from LeRobot; methods are called on its objects by their names."""
     listed = set(lerobot_patches.USED_NAMES)
     for path in Path(lerobot_patches.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

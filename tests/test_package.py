@@ -13,7 +13,7 @@ import pytest
 SOURCE = Path(__file__).parent.parent / "src" / "lerobot_uca"
 DISTRIBUTION = "lerobot_policy_uca_flow"
 
-# What a module or folder may import from this package. Imports run one way; what is not listed is a leaf.
+# The modules or folders that each may import from this package. Imports run one way; unlisted ones are leaves.
 ALLOWED = {
     "inference": {"errors"},
     "objectives": {"meanflow", "networks"},

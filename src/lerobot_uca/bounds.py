@@ -18,7 +18,7 @@ BOUNDS = "bounds"
 
 @dataclass(frozen=True)
 class Bounds:
-    """Which numbers are valid; None for no limit."""
+    """The range of valid numbers; None for no limit."""
 
     least: float | None
     above: float | None
@@ -27,7 +27,7 @@ class Bounds:
     is_optional: bool
 
     def fault(self, value: Any) -> str | None:
-        """What must hold and does not, such as 'at least 1'."""
+        """The rule that the value breaks, such as 'at least 1'; None if it is valid."""
         limits = (
             (self.least, "at least", lambda limit: value >= limit),
             (self.above, "above", lambda limit: value > limit),

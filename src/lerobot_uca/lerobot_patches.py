@@ -134,7 +134,7 @@ class _DecoderWarning(logging.Filter):
 
 
 def shorten_decoder_warning() -> None:
-    """LeRobot prints a page of torchcodec's traceback for each dataset where there is no FFmpeg."""
+    """Without FFmpeg, LeRobot prints a page of torchcodec's traceback for each dataset."""
     target = logging.getLogger("lerobot.utils.import_utils")
     if not any(isinstance(each, _DecoderWarning) for each in target.filters):
         target.addFilter(_DecoderWarning())
@@ -146,7 +146,7 @@ _of_point_cloud_policy: ContextVar[bool] = ContextVar("of_point_cloud_policy", d
 
 
 def make_registered_steps_only() -> None:
-    """No checkpoint can name code to run; see `checkpoints/steps.py`. LeRobot imports and calls whatever it names."""
+    """A checkpoint cannot name code to run; see `checkpoints/steps.py`. LeRobot imports and calls whatever it names."""
 
     def checked(build: Callable[..., Any]) -> Callable[..., Any]:
         def build_steps(cls: type, loaded_config: dict[str, Any], overrides: dict[str, Any]) -> Any:
@@ -173,7 +173,7 @@ def make_registered_steps_only() -> None:
 
 
 def report_damaged_checkpoints() -> None:
-    """What is missing or damaged is named in one line. LeRobot shows a library's traceback."""
+    """One line names the missing or damaged part. LeRobot shows a library's traceback."""
 
     def policy(load: Callable[..., Any]) -> Callable[..., Any]:
         def from_pretrained(cls: type, pretrained_name_or_path: Path | str, **kwargs: Any) -> Any:
@@ -208,7 +208,7 @@ def resume_exactly() -> None:
 
 
 def _remember_success(evaluate: Callable[..., Any]) -> Callable[..., Any]:
-    """For the policy's page on the Hub."""
+    """Remember the success rate for the policy's page on the Hub."""
 
     def eval_policy_all(*args: Any, **kwargs: Any) -> Any:
         info = evaluate(*args, **kwargs)
@@ -434,7 +434,7 @@ def _is_given(option: str) -> bool:
 # Replacing ------------------------------------------------------------------------------------------------------------
 
 Wrap = Callable[[Callable[..., Any]], Callable[..., Any]]
-"""From what LeRobot has to what stands in its place."""
+"""Maps LeRobot's function to the one that replaces it."""
 
 
 def _wrapped(original: Callable[..., Any], wrap: Wrap) -> Callable[..., Any]:

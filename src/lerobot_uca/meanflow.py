@@ -27,7 +27,7 @@ VelocityNetwork = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
 class Intervals(NamedTuple):
-    """For each sample of a batch an interval [r, t]. The first `n_instants` of them have no length.
+    """An interval [r, t] for each sample of a batch. The first `n_instants` of them have length 0.
 
     Args:
         t: (B,), where the interval ends.
@@ -122,7 +122,7 @@ def adaptive_l2(error: Tensor, mask: Tensor, *, gamma: float, c: float) -> Tenso
 
 
 class Losses(NamedTuple):
-    """For each sample, (B,): the loss of the u branch and of the v branch (None without dual-pass supervision)."""
+    """The loss of each sample, (B,): of the u branch and of the v branch (None without dual-pass supervision)."""
 
     u: Tensor
     v: Tensor | None

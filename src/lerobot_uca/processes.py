@@ -29,7 +29,7 @@ _received: list[int] = []
 def _end(number: int, _: FrameType | None) -> None:
     signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
     _received.append(number)
-    # Not print: the signal may have come while something was being printed.
+    # A print could fail: the signal may have come while something was being printed.
     os.write(2, f"\nended by {signal.Signals(number).name}\n".encode())
     raise SystemExit(128 + number)
 

@@ -102,7 +102,7 @@ def test_workers_read_in_batches_too(dataset_root, tmp_path, context):
 
 
 def test_a_held_out_split_and_resumed_order_read_the_same(dataset_root):
-    """As lerobot-train makes them: episodes of a split, and a sampler that starts in the middle of an epoch."""
+    """lerobot-train makes them so: episodes of a split, and a sampler that starts in the middle of an epoch."""
     for episodes in ([0, 1], [2]):
         dataset = open_dataset(dataset_root, episodes=episodes, delta_timestamps=WINDOWS)
         sampler = EpisodeAwareSampler(

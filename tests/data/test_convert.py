@@ -91,7 +91,7 @@ def test_video_is_converted_too(tmp_path):
 
 
 def write_zarr(path, *, channels=6, lengths=(5, 7), without=()):
-    """As DP3 lays out its demonstrations."""
+    """Write demonstrations in DP3's layout."""
     zarr = pytest.importorskip("zarr")
     rng = np.random.default_rng(0)
     n_steps = sum(lengths)

@@ -30,7 +30,7 @@ def write_nothing(folder: Path, **options: bool) -> None:
 
 
 def content(folder: Path) -> list[str]:
-    """What a listing of its parent shows, hidden files too, and the text in it."""
+    """The listing of its parent, hidden files too, and the text in it."""
     return [*sorted(path.name for path in folder.parent.iterdir()), (folder / "file").read_text()]
 
 
@@ -83,7 +83,7 @@ def test_a_second_run_is_refused(tmp_path):
 
 
 def die_while_writing(folder: Path, moment: str) -> None:
-    """At 'write', or at the worst moment of an overwrite: the old folder has moved away, the new is not there yet."""
+    """Die at 'write', or at an overwrite's worst moment: the old folder has moved away, the new is not there yet."""
     rename = Path.rename
 
     def rename_then_die(self: Path, target: Path) -> Path:

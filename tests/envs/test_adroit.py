@@ -12,7 +12,7 @@ from lerobot_uca.envs.experts.dapg import DAPGExpert, DAPGWeights
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.geometry import Crop
 
-# What gymnasium-robotics calls the state it starts from, besides qpos and qvel.
+# gymnasium-robotics's names of the state it starts from, besides qpos and qvel.
 OWN_STATE = {"hammer": "board_pos", "door": "door_body_pos", "pen": "desired_orien"}
 
 

@@ -118,7 +118,7 @@ def test_a_depth_image_gives_the_cloud_that_the_environment_gives(kind, task):
 
 
 def distances(points: np.ndarray, cloud: np.ndarray) -> np.ndarray:
-    """From each of the points to the nearest one of the cloud [m]."""
+    """The distance from each of the points to the nearest one of the cloud [m]."""
     return np.array([np.linalg.norm(cloud - point, axis=1).min() for point in points])
 
 

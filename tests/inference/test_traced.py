@@ -242,6 +242,6 @@ def test_it_can_be_copied_and_sent(runtime, duplicate):
 
 
 def test_openvino_reports_to_nobody():
-    """By itself it starts a process that sends usage data over the network."""
+    """OpenVINO by itself starts a process that sends usage data over the network."""
     code = "import sys, lerobot_uca.inference.openvino_function as f; assert sys.modules['openvino_telemetry'] is None"
     subprocess.run([sys.executable, "-c", code], check=True)

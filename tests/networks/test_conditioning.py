@@ -56,7 +56,7 @@ def test_forward_mode_derivative_equals_finite_differences(conditioning):
 @pytest.mark.parametrize("dim", [128, 256])
 @pytest.mark.parametrize("n_layers", [2, 4, 8])
 def test_ablations_have_the_methods_size(dim, n_layers):
-    """To within 1 %, at the default sizes and others."""
+    """The sizes agree to 1 %, at the default sizes and others."""
     sizes = {"n_obs_features": 128, "n_actions": 4, "n_timestep_tokens": 4, "n_interval_tokens": 4, "n_heads": 4}
     counts = {
         name: sum(parameter.numel() for parameter in make(name, **sizes, dim=dim, n_layers=n_layers).parameters())

@@ -75,7 +75,7 @@ def test_the_loss_written_out_for_one_line():
 
 
 def test_gradients_go_through_both_times():
-    """No stop-gradient on the later time, unlike in FlowPolicy's paper."""
+    """The later time has no stop-gradient, unlike in FlowPolicy's paper."""
     scale = torch.ones(2, requires_grad=True)
     calls = iter(scale)
     x = torch.randn(50, 4, 3)

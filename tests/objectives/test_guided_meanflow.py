@@ -61,7 +61,7 @@ def test_one_step_turns_noise_into_data():
 
 
 def test_the_error_is_weighted_without_gradient():
-    """With u = 0 the guided target is 2 (e - x), of which e and x are known."""
+    """The guided target at u = 0 is 2 (e - x), of which e and x are known."""
     x = torch.randn(B, T, A)
     scale = torch.zeros((), requires_grad=True)
     torch.manual_seed(0)

@@ -1,4 +1,4 @@
-"""From depth images to a cloud."""
+"""Clouds from depth images."""
 
 import dataclasses
 
@@ -111,7 +111,7 @@ def test_many_pixels_are_thinned_out_evenly_first():
     assert len(make.points([depth], max_points=1024)) == 1024
 
     def radius(sample):
-        """How far a point of the scene is from the sample, at most [m]."""
+        """The largest distance of a point of the scene from the sample [m]."""
         return np.sqrt(((all_points[:, None] - sample[None]) ** 2).sum(-1)).min(axis=1).max()
 
     assert radius(cloud) < 1.3 * radius(sample_farthest(all_points, 128))

@@ -71,7 +71,7 @@ def test_lerobot_finds_policy_and_processors_by_the_types_name(name):
 
 @every_policy
 def test_training_steps_lower_the_loss_of_a_batch(variant):
-    """At the same noise and the same times."""
+    """The noise and the times stay the same."""
     policy = make(variant).train()
     batch = make_batch(policy.config)
     optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=3e-4)

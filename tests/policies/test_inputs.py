@@ -126,7 +126,7 @@ def test_a_huge_input_is_named(inference, key):
 
 
 def test_large_values_are_computed_with(policy):
-    """As a dataset's out-of-range readings may give."""
+    """A dataset's out-of-range readings may give such values."""
     observation = make_observation()
     observation[OBS_STATE][0, 3] = 1e5
     assert policy.select_action(observation).isfinite().all()

@@ -33,7 +33,7 @@ from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
 
 LOG_STEP = (np.log(13.5) - np.log(3.51)) / 4095
-"""Of LeRobot's depth codes: log(depth + 3.5 m) of 0.01 to 10 m in 12 bits."""
+"""The step of LeRobot's depth codes: log(depth + 3.5 m) of 0.01 to 10 m in 12 bits."""
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["tiff", "video"])
@@ -57,7 +57,7 @@ def policy_config(**changes):
 
 @pytest.fixture
 def seen(monkeypatch):
-    """What the policy sees in training: normalised clouds (B, O, N, 3), and the index of their newest frame."""
+    """The policy's input in training: normalised clouds (B, O, N, 3), and the index of their newest frame."""
     batches = []
     forward = UCAFlowPolicy.forward
 
@@ -125,7 +125,7 @@ def every_live_point(index):
 
 
 def gap(cloud, points):
-    """How far a point of a normalised cloud is from all points [m]."""
+    """The distance of a normalised cloud's points from all points [m]."""
     low, high = np.float32(CROP.low), np.float32(CROP.high)
     metres = (cloud + 1) / 2 * (high - low) + low
     return np.linalg.norm(metres[:, None] - points[None], axis=-1).min(axis=1).max()
@@ -161,7 +161,7 @@ def test_training_resuming_training_further_and_the_robot_see_the_same_clouds(
 
 
 def resume(checkpoint, monkeypatch):
-    """As a user does, for one more step."""
+    """Resume as a user does, for one more step."""
     arguments = ["--resume=true", f"--config_path={checkpoint}/train_config.json", "--steps=2"]
     monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
     lerobot_train.train()

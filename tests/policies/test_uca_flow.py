@@ -96,7 +96,7 @@ def test_three_actions_are_executed_from_each_prediction(policy, batch_size):
 
 
 def test_predict_action_chunk_remembers_single_observations(policy):
-    """As asynchronous inference calls it: one frame at a time, and still with a history."""
+    """Asynchronous inference calls it so: one frame at a time, and still with a history."""
     noise = torch.randn(1, T, N_ACTIONS)
     a, b = make_observation(), make_observation()
     policy.predict_action_chunk(a, noise=noise)
@@ -135,7 +135,7 @@ def test_the_default_runtime_gives_pytorchs_actions(changes, batch_size, caplog)
 
 @pytest.mark.skipif(shutil.which(os.environ.get("CXX", "g++")) is None, reason="torch.compile needs a C++ compiler")
 def test_torch_compile_gives_pytorchs_actions():
-    """On a GPU the same path records CUDA graphs."""
+    """The same path records CUDA graphs on a GPU."""
     assert_acts_like_pytorch(UCAFlowPolicy(make_config(inference="compile", n_layers=1)).eval(), batch_size=2)
 
 
@@ -248,7 +248,7 @@ def test_loss_of_a_batch_is_the_mean_of_its_samples(policy):
 
 
 def test_training_equals_the_plain_method(policy, monkeypatch):
-    """No winners, no shared calls, no left-out tokens, PyTorch's own tangents: the same loss and gradients."""
+    """The plain method (no winners, shared calls or left-out tokens; PyTorch's tangents) has the same gradients."""
     policy.train()
     batch = make_batch(policy.config, batch_size=8)
     torch.manual_seed(1)

@@ -34,7 +34,7 @@ def evaluated(policy, *, n_envs):
 
 
 def evaluated_by_lerobot(policy):
-    """By LeRobot's own loop, with the noise that each of our episodes draws."""
+    """The result of LeRobot's own loop, with the noise that each of our episodes draws."""
     generators = [torch.Generator().manual_seed(seed) for seed in SEEDS]
     config, select_action, n_calls = policy.config, policy.select_action, 0
 

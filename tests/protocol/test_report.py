@@ -63,7 +63,7 @@ def read_csv(path):
 
 
 def test_the_papers_averages_are_the_means_of_its_columns():
-    """As printed: the numbers were copied right. UCA-Flow's own average success is the one that does not agree."""
+    """The numbers are as printed: they were copied right. Only UCA-Flow's own average success does not agree."""
     n_tasks = [1, 1, 1, *(len(PAPER_GROUPS[group]) for group in ("easy", "medium", "hard", "very_hard"))]
     for table in (SUCCESS, MILLISECONDS):
         for policy, row in table.items():
@@ -113,7 +113,7 @@ def test_with_less_than_five_evaluations_the_papers_rule_has_no_number(tmp_path)
 
 
 def test_differences_are_paired(folder, tmp_path):
-    """Of seed 0's episodes on reach, the only ones that both have: 80 and 60 of the same 100."""
+    """Both have only seed 0's episodes on reach: 80 and 60 of the same 100."""
     main(["report", str(folder.path), f"--output={tmp_path}/report"])
     _, row = read_csv(tmp_path / "report" / "differences.csv")
     assert row[:2] == ["UCA-Flow minus - Unified/a: AdaLN", "1"]

@@ -17,7 +17,7 @@ def test_rows_come_back_as_they_were_written(tmp_path):
 
 
 def test_a_file_is_whole_or_not_there(tmp_path):
-    """As when the process is killed in the middle."""
+    """The process may be killed in the middle."""
 
     def dying():
         yield ROWS[0]

@@ -32,7 +32,7 @@ def test_a_setting_of_the_package_trains_every_task_and_policy(name):
 
 
 def test_no_episode_is_used_twice():
-    """Not by two evaluations, not by demonstrations, LeRobot's evaluations or the choice of a setting."""
+    """Evaluations, demonstrations, LeRobot's evaluations and the choice of a setting use different episodes."""
     setting = Setting.load("small")
     tuning = REACH._replace(seed=FIRST_TUNING_SEED)
     used = [range(1000, 2000), range(1_000_000, 1_100_000)]

@@ -12,11 +12,11 @@ from lerobot_uca import lerobot_patches
 lerobot_patches.install()  # what lerobot_eval has brought
 
 N_STEPS = 12
-"""Of 39 frames in batches of 8, so 5 steps an epoch."""
+"""The steps of the training, 5 an epoch: 39 frames in batches of 8."""
 
 
 def train(*arguments: object) -> None:
-    """What `lerobot-train` does, in this process."""
+    """Run `lerobot-train` in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["lerobot-train", *map(str, arguments)])
         patch.setattr(lerobot_train, "init_logging", lambda **_: None)  # it would take pytest's handlers away

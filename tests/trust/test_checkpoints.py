@@ -31,7 +31,7 @@ def resume(run: Path, step: str, *options: str) -> None:
 
 @pytest.mark.parametrize("step", [3, 5, 8, 10])
 def test_a_resumed_training_equals_the_unbroken_one_bit_for_bit(trained, tmp_path, step):
-    """In the middle of the first and the second epoch, and at the end of each."""
+    """The step lies in the middle of the first or the second epoch, or at the end of one."""
     checkpoint = Path("checkpoints", f"{step:06d}")
     shutil.copytree(trained / checkpoint, tmp_path / checkpoint)
     resume(tmp_path, checkpoint.name)

@@ -34,7 +34,7 @@ def load(checkpoint: Path) -> None:
 
 
 def evaluate(checkpoint: Path) -> None:
-    """What `lerobot-eval` does, in this process."""
+    """Run `lerobot-eval` in this process."""
     with pytest.MonkeyPatch.context() as patch:
         options = ["--env.type=metaworld_pointcloud", "--env.n_points=32", "--eval.n_episodes=1", "--eval.batch_size=1"]
         output = f"--output_dir={checkpoint / 'evaluation'}"

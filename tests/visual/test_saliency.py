@@ -14,7 +14,7 @@ def inputs(policy, batch_size=2):
 
 
 def test_saliency_is_the_gradients_length(policy):
-    """By finite differences in double precision."""
+    """Checked by finite differences in double precision."""
     policy = policy.double()
     cloud, state, noise = (each.double() for each in inputs(policy))
     got = saliency(policy, cloud, state, noise)

@@ -1,1 +1,1 @@
-"""What a checkpoint may hold, how it is saved, and how training goes on from it."""
+"""Checkpoints: their valid content, saving, and resuming a training."""

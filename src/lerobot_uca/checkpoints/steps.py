@@ -1,4 +1,4 @@
-"""Which processor steps a checkpoint may have. It comes from somewhere else, and must not choose code to run.
+"""The processor steps that a checkpoint may have. It comes from somewhere else, and must not choose code to run.
 
 LeRobot imports whatever a step of `policy_preprocessor.json` names (`{"class": "os.system"}`) and calls it with the
 step's settings. Some of its registered steps load models by name and run the Python code that lies beside them

@@ -1,6 +1,6 @@
 """Batched reading of LeRobot datasets without cameras, which stock LeRobot 0.6.1 decodes row by row.
 
-PyTorch's DataLoader asks a dataset for a whole batch where it has `__getitems__`. LeRobotDataset has none, so each
+PyTorch's DataLoader asks a dataset for a whole batch if it has `__getitems__`. LeRobotDataset lacks it, so each
 sample costs a full-row decode for every delta query: 15 to 70 ms for two clouds of 512 points. The subclass here
 decodes all columns once into contiguous tensors and then gathers windows from them; the samples equal those of stock
 reading bit for bit. Datasets with images, videos or language columns, and datasets above 4 GiB, are read as before.

@@ -1,4 +1,4 @@
-"""Of the episodes chosen for a training: their statistics, and a check that their data is finite.
+"""Statistics of the episodes chosen for a training, and a check that their data is finite.
 
 `masks` are the features to look at and, for each, the feature that says which of its points are valid, if there is one.
 """
@@ -88,7 +88,7 @@ def _columns(dataset: Any) -> Columns | None:
 
 
 def _episode_statistics(dataset: Any, masks: Masks) -> dict[int, Statistics]:
-    """By chosen episode, from the files beside the episodes' other metadata."""
+    """The statistics of each chosen episode, from the files beside the episodes' other metadata."""
     source = pyarrow.dataset.dataset(dataset.meta.root / "meta" / "episodes", format="parquet")
     paths = {name: name.split("/")[1:] for name in source.schema.names if name.startswith("stats/")}
     wanted = {name: path for name, path in paths.items() if path[0] in masks}

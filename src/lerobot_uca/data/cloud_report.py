@@ -1,4 +1,4 @@
-"""How good recorded clouds are: numbers as text, and a picture."""
+"""A report on the quality of recorded clouds: numbers as text, and a picture."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from lerobot_uca.errors import UserError
 
 
 class EpisodeReport(NamedTuple):
-    """What one episode of L steps was like."""
+    """The numbers of one episode of L steps."""
 
     episode: int
     n_points: NDArray[np.int_]  # (L,) points inside the crop, before sampling

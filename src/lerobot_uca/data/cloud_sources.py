@@ -1,4 +1,4 @@
-"""Where recorded clouds come from: LeRobot datasets with depth or clouds, DP3's zarr, folders of PLY or NPZ files.
+"""Sources of recorded clouds: LeRobot datasets with depth or clouds, DP3's zarr, folders of PLY or NPZ files.
 
 A source is light to send to another process and opens its files there. Letters: L steps, N points.
 """
@@ -48,7 +48,7 @@ class Source(ABC):
     @property
     @abstractmethod
     def n_episodes(self) -> int:
-        """How many episodes there are."""
+        """The number of episodes."""
 
     @abstractmethod
     def frames(self, episode: int) -> list[Frame]:
@@ -61,19 +61,19 @@ class Source(ABC):
 
     @property
     def recipe(self) -> CloudRecipe | None:
-        """How clouds are made from depth images, if they are."""
+        """The recipe by which clouds are made from depth images, if they are."""
         return None
 
     def names(self, _: str) -> list[str] | None:
-        """What each number of a feature means, if the source knows it."""
+        """The names of a feature's numbers, if the source knows them."""
         return None
 
     def left_out(self) -> list[str]:
-        """What of the source is not kept."""
+        """The parts of the source that are not kept."""
         return []
 
     def _cropped(self, points: NDArray[Any]) -> tuple[NDArray[np.float32], int, float]:
-        """Of points (N, 3 or more) the finite ones inside the crop, their number, and the share that is not finite."""
+        """The finite points inside the crop, of (N, 3 or more), their number, and the share that is not finite."""
         xyz = np.asarray(points, dtype=np.float32)[:, :3]
         finite = np.asarray(np.all(np.isfinite(xyz), axis=1))
         inside = finite if self.crop is None else finite & self.crop.contains(np.where(finite[:, None], xyz, np.inf))
@@ -102,12 +102,12 @@ class LeRobotSource(Source):
 
     @property
     def features(self) -> dict[str, Any]:
-        """Of the dataset, as LeRobot describes them."""
+        """The dataset's features, as LeRobot describes them."""
         return self._dataset.features
 
     @property
     def n_episodes(self) -> int:
-        """How many episodes there are."""
+        """The number of episodes."""
         return self._dataset.num_episodes
 
     @property
@@ -117,14 +117,14 @@ class LeRobotSource(Source):
 
     @property
     def recipe(self) -> CloudRecipe | None:
-        """That of depth, or the one that the dataset's clouds were made with."""
+        """The recipe of the depth images, or the one that the dataset's clouds were made with."""
         if self.depth_recipe is None and self._cloud_key is not None:
             made_with = (self.features[self._cloud_key].get("info") or {}).get(RECIPE_INFO)
             return CloudRecipe.from_dict(made_with) if made_with and self.crop is None else None
         return self.depth_recipe
 
     def names(self, key: str) -> list[str] | None:
-        """What each number of a feature means."""
+        """The names of a feature's numbers."""
         return self.features[key].get("names")
 
     def left_out(self) -> list[str]:
@@ -205,7 +205,7 @@ class ZarrSource(Source):
 
     @property
     def n_episodes(self) -> int:
-        """How many episodes there are."""
+        """The number of episodes."""
         return self._group[ZARR_KEYS[3]].shape[0]
 
     def frames(self, episode: int) -> list[Frame]:
@@ -265,7 +265,7 @@ class FolderSource(Source):
 
     @property
     def n_episodes(self) -> int:
-        """How many episodes there are."""
+        """The number of episodes."""
         return len(self._episodes)
 
     def names(self, key: str) -> list[str] | None:
@@ -319,7 +319,7 @@ def find_source(path: Path, crop: Crop | None, task: str) -> Source:
     """The source of a path, by what lies in it.
 
     Raises:
-        UserError: if it is none of the known kinds.
+        UserError: if its kind is unknown.
     """
     if (path / "meta" / "info.json").is_file():
         return LeRobotSource(path, crop)

@@ -54,7 +54,7 @@ class CollectConfig:
     repo_id: str
     # Folder to write; by default where LeRobot looks for it, $HF_LEROBOT_HOME/repo_id.
     root: Path | None = None
-    # Who demonstrates. Meta-World's experts are built in; Adroit's are files: weights as .npz or as an original DAPG
+    # The demonstrator. Meta-World's experts are built in; Adroit's are files: weights as .npz or as an original DAPG
     # pickle, or a Minari dataset such as minari:D4RL/door/expert-v2. '{task}' stands for each task.
     expert: str | None = None
     # Weight of the expert's new action against the last one, a first-order filter: 1 for the expert as it is. An expert

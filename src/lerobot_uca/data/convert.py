@@ -48,7 +48,7 @@ class ConvertConfig:
     or with clouds, a zarr of DP3's layout, or a folder of PLY or NPZ clouds with a frames.csv (docs/own_data.md).
     """
 
-    # What to convert: a folder.
+    # The folder to convert.
     source: Path
     # Name of the new dataset, 'user/name'.
     repo_id: str
@@ -62,11 +62,11 @@ class ConvertConfig:
     n_points: int = within(512, least=1, most=100_000)
     # Folder of the cameras' calibrations; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
-    # Which episodes, such as [0,1,5]; by default all.
+    # The episodes to convert, such as [0,1,5]; by default all.
     episodes: list[int] | None = None
     # Steps a second of a source that does not know it (zarr, PLY, NPZ).
     fps: int | None = within(None, least=1, most=10_000)
-    # What was done, for a source that does not know it.
+    # The task, for a source that does not know it.
     task: str = ""
     # Processes that read and sample; 0 does it in this one.
     num_workers: int = within(0, least=0, most=1024)
@@ -144,7 +144,7 @@ def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
 
 
 def _sample(points: NDArray[np.float32], n_points: int) -> NDArray[np.float32]:
-    """As `DepthToCloud` samples. An empty cloud stays visible as NaN until the report is written."""
+    """Sample as `DepthToCloud` does. An empty cloud stays visible as NaN until the report is written."""
     if len(points) == 0:
         return np.full((n_points, 3), np.nan, np.float32)
     return sample_farthest(points, n_points)

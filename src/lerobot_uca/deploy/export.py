@@ -25,14 +25,14 @@ from lerobot_uca.inference.traced import to_onnx
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
-# What these steps do is the same for all observations, so that a trace of it holds. A file takes clouds: the step that
+# These steps do the same for all observations, so that a trace of them holds. A file takes clouds: the step that
 # makes them from depth images has nothing to do.
 TRACEABLE_STEPS = {
     *("rename_observations_processor", "depth_to_cloud_processor", "point_cloud_processor", "to_batch_processor"),
     *("device_processor", "normalizer_processor", "unnormalizer_processor"),
 }
 FILES = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
-"""Of a checkpoint, besides its weights."""
+"""A checkpoint's files besides its weights."""
 
 TOLERANCE = 1e-4
 """Largest difference of the file's actions from the policy's, as a share of the largest; float32 rounds far below."""

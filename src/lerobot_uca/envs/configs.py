@@ -33,7 +33,7 @@ class PointCloudEnvConfig(EnvConfig):
 
     # Points of each cloud.
     n_points: int = within(512, least=1, most=100_000)
-    # What is observed besides the robot's state: point_cloud, or depth, the image that such a cloud is made from.
+    # The observation besides the robot's state: point_cloud, or depth, the image that such a cloud is made from.
     observation: str = "point_cloud"
 
     def __post_init__(self) -> None:
@@ -66,14 +66,14 @@ class PointCloudEnvConfig(EnvConfig):
 
     @abstractmethod
     def view(self, task: str) -> tuple[Camera, Crop]:
-        """What a task is seen with, and what belongs to its cloud."""
+        """The camera that sees a task, and the crop of its cloud."""
 
     def _views(self) -> list[tuple[Camera, Crop]]:
         """The different views of all tasks."""
         return list(dict.fromkeys(self.view(task) for tasks in self.tasks().values() for task in tasks))
 
     def recipe(self) -> CloudRecipe | None:
-        """How clouds are made from depth images; None if the tasks differ in camera or crop."""
+        """The recipe for clouds from depth images; None if the tasks differ in camera or crop."""
         views = self._views()
         if len(views) != 1:
             return None
@@ -119,7 +119,7 @@ class PointCloudEnvConfig(EnvConfig):
 
     @override
     def get_env_processors(self) -> tuple[Any, Any]:
-        """No processing. Training asks for it before its first step: a wrong task must not be found hours later."""
+        """Empty processors. Training asks for them before its first step: a wrong task is not found hours later."""
         self.validate()
         return super().get_env_processors()
 
@@ -195,7 +195,7 @@ class AdroitPointCloudConfig(PointCloudEnvConfig):
     n_points: int = within(1024, least=1, most=100_000)
     # The rate of actions, each of which is repeated twice; it cannot be changed.
     fps: int = adroit.FPS
-    # What counts as success. final: the goal is reached when the episode's time is over, as in the papers.
+    # The measure of success. final: the goal is reached when the episode's time is over, as in the papers.
     # any: the goal is reached at any time, as in gymnasium-robotics.
     success: str = "final"
 

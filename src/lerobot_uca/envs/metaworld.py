@@ -41,7 +41,7 @@ HOLE_TASKS = ("hand-insert", "pick-out-of-hole", "sweep-into")
 
 
 def crop_of(task: str) -> Crop:
-    """What belongs to a task's cloud."""
+    """The box that holds a task's cloud."""
     return HOLE_CROP if task in HOLE_TASKS else CROP
 
 

@@ -1,4 +1,4 @@
-"""From what a user writes after `--env.task=` to tasks."""
+"""The tasks that a user's `--env.task=` means."""
 
 from collections.abc import Collection, Mapping
 from difflib import SequenceMatcher

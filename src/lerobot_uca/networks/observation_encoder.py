@@ -1,4 +1,4 @@
-"""From point clouds and robot states to one feature vector for each observation step.
+"""The encoder: point clouds and robot states become one feature vector for each observation step.
 
 Letters: B samples, O observation steps, N points, S state dimensions, F features.
 """

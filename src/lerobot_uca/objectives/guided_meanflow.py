@@ -21,7 +21,7 @@ N_DISPERSED_LEVELS = 2  # of the way down, the first ones
 
 
 class Losses(NamedTuple):
-    """For each sample, (B,): the weighted error of u, and the dispersive loss of the batch, the same for all."""
+    """The losses of each sample, (B,): the weighted error of u, and the batch's dispersive loss, the same for all."""
 
     u: Tensor
     dispersive: Tensor

@@ -27,7 +27,7 @@ FRAMES = ("base", "tool")
 MAX_DISTANCE = 5.0
 """[m] A camera farther from its frame is a mistake in units: arms reach 1.3 m."""
 TOLERANCE = 1e-3
-"""How far a rotation may be from orthonormal; a pose written with four decimals passes."""
+"""A rotation's largest distance from orthonormal; a pose written with four decimals passes."""
 HEADER = "# Lengths in metres, pixels in pixels. pose: X_base_camera (frame: base) or X_tool_camera (frame: tool),\n"
 HEADER += "# OpenCV's convention: the camera's x to the right, y down, z forward. Written by lerobot-uca-calibrate.\n"
 
@@ -38,7 +38,7 @@ class CalibrationError(ValueError):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where a camera is, and how it maps points to pixels.
+    """A camera's pose, and its map from points to pixels.
 
     Args:
         camera: intrinsics, image size and pose; its name is the one in the robot's configuration ('front' of
@@ -59,7 +59,7 @@ class Calibration:
     residual: dict[str, float] = field(default_factory=dict)
 
     def view(self, near: float = NEAR, far: float = FAR) -> DepthView:
-        """What turns this camera's depth images into points in the base frame.
+        """A view that turns this camera's depth images into points in the base frame.
 
         Raises:
             CalibrationError: for a camera on the arm, whose pose in the base frame changes.
@@ -72,7 +72,7 @@ class Calibration:
         return DepthView(self.camera, self.depth_unit, near, far)
 
     def as_dict(self) -> dict[str, Any]:
-        """What a file holds: numbers, text and lists only."""
+        """The content of a file: numbers, text and lists only."""
         camera = asdict(self.camera)
         pose, name = camera.pop("X_world_camera"), camera.pop("name")
         return {
@@ -152,7 +152,7 @@ def read_calibrations(folder: Path) -> dict[str, Calibration]:
 
 
 def pose_difference(X_world_a: Any, X_world_b: Any) -> tuple[float, float]:
-    """How far two poses are apart: (mm, deg)."""
+    """The distance between two poses: (mm, deg)."""
     a, b = np.asarray(X_world_a, dtype=np.float64), np.asarray(X_world_b, dtype=np.float64)
     return float(1e3 * np.linalg.norm(a[:3, 3] - b[:3, 3])), rotation_angle(a[:3, :3].T @ b[:3, :3])
 

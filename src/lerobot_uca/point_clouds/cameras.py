@@ -1,6 +1,6 @@
 """Cameras that see a MuJoCo scene by ray casting.
 
-Like MuJoCo's own renderer they see the geoms of the visible groups and the task's markers (goal sites, which are no
+Like MuJoCo's own renderer they see the geoms of the visible groups and the task's markers (goal sites, which are not
 geoms and which `mj_multiRay` therefore passes through).
 """
 

@@ -1,4 +1,4 @@
-"""From depth images to a point cloud: the same function for recorded data, live cameras and simulated ones.
+"""Point clouds from depth images: the same function for recorded data, live cameras and simulated ones.
 
 Geometry only. All lengths are metres; the world frame of a view's camera is the robot's base frame, so that
 `camera.X_world_camera` is X_base_camera.
@@ -41,7 +41,7 @@ def unit_of(dtype: np.dtype[Any]) -> float:
 
 @dataclass(frozen=True)
 class DepthView:
-    """What turns one camera's depth image into points.
+    """Turns one camera's depth image into points.
 
     Args:
         camera: intrinsics, image size and pose in the robot's base frame.
@@ -138,7 +138,7 @@ class _Selector:
         return self._origin + self._rays[chosen] * (depth[chosen, None] * np.float32(unit))
 
     def _inside(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of values for each ray those inside the rectangle of pixels that meet the crop."""
+        """The rays' values inside the rectangle of pixels that meet the crop."""
         camera = self.view.camera
         image = values.reshape(camera.height, camera.width, *values.shape[1:])[self._rows, self._columns]
         return image.reshape(-1, *values.shape[1:])
@@ -146,7 +146,7 @@ class _Selector:
     def _limits_in(self, unit: float) -> tuple[Points, Points]:
         """The lowest and highest depth of each pixel that counts, in units: strictly between near and far.
 
-        In the image's own units, because 10 mm must be 0.01 m exactly. A pixel that misses the crop has no such depth.
+        They are in the image's own units, because 10 mm must be 0.01 m exactly. A pixel that misses the crop has none.
         """
         near, far = np.float32(self.view.near / unit), np.float32(self.view.far / unit)
         lowest = np.maximum((self._enter / unit).astype(np.float32), np.nextafter(near, far))
@@ -158,7 +158,7 @@ def as_image(camera: Camera, image: NDArray[Any]) -> NDArray[Any]:
     """A depth image as (H, W), checked against the camera it is said to come from.
 
     Raises:
-        DepthError: for another size, or for values that are no numbers.
+        DepthError: for another size, or for values that are not numbers.
     """
     squeezed = np.squeeze(image)
     if squeezed.shape != (camera.height, camera.width) or squeezed.dtype.kind not in "uif":
@@ -170,13 +170,13 @@ def as_image(camera: Camera, image: NDArray[Any]) -> NDArray[Any]:
 
 
 def is_valid(view: DepthView, image: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which pixels of a depth image have a depth, (H, W)."""
+    """Whether each pixel of a depth image has a depth, (H, W)."""
     depth = as_image(view.camera, image).astype(np.float64) * (view.unit or unit_of(image.dtype))
     return (depth > view.near) & (depth < view.far)
 
 
 def describe(view: DepthView, image: NDArray[Any]) -> str:
-    """What a depth image shows, in a line: its valid share and the box of its points, or a unit that would fit."""
+    """A depth image in a line: its valid share and the box of its points, or a unit that would fit."""
     camera, unit = view.camera, view.unit or unit_of(image.dtype)
     depth = as_image(camera, image).astype(np.float64)
     valid = is_valid(view, image)
@@ -205,6 +205,6 @@ def to_millimetres(depth: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:
 
 
 def _span(flags: NDArray[np.bool_]) -> slice:
-    """From the first to the last flag that is set; empty if none is."""
+    """The slice from the first to the last set flag; empty if none is set."""
     (indices,) = np.nonzero(flags)
     return slice(int(indices[0]), int(indices[-1]) + 1) if len(indices) else slice(0, 0)

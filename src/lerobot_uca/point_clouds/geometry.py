@@ -85,7 +85,7 @@ class Camera:
 
     @property
     def position(self) -> Array:
-        """In the world, (3,) [m]."""
+        """The position in the world, (3,) [m]."""
         return np.array(self.X_world_camera)[:3, 3].copy()
 
     def ray_directions(self) -> Array:

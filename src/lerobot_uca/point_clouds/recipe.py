@@ -1,4 +1,4 @@
-"""How a cloud is made from depth images: cameras, crop and sampling, as plain data.
+"""The recipe for a cloud from depth images: cameras, crop and sampling, as plain data.
 
 A converted dataset, a policy's configuration and its preprocessor hold the same recipe. Crop and sampling belong to the
 policy; calibrations belong to an installation, and a recipe remembers which ones it was made with.
@@ -21,11 +21,11 @@ SIMULATED = "simulated"
 """The method of a calibration that is known."""
 
 RECIPE_INFO = "cloud_recipe"
-"""How a feature's clouds were made, or are to be made of its depth images: a LeRobot dataset's
+"""The key of a feature's recipe, by which its clouds were made or are to be made: a LeRobot dataset's
 features[key]['info'][RECIPE_INFO] is a `CloudRecipe` as a dictionary."""
 
 Features = Mapping[str, Mapping[str, Any]]
-"""Of a LeRobot dataset."""
+"""The features of a LeRobot dataset."""
 
 SAME = (0.01, 0.001)
 """(mm, deg) Poses this close are the same: files round."""
@@ -54,7 +54,7 @@ class DepthSource:
 
 @dataclass(frozen=True)
 class CloudRecipe:
-    """What turns depth images into a policy's cloud.
+    """The recipe that turns depth images into a policy's cloud.
 
     Args:
         sources: the cameras, in the order in which their images are given.
@@ -77,7 +77,7 @@ class CloudRecipe:
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Of the depth images among the observations."""
+        """The keys of the depth images among the observations."""
         return tuple(source.key for source in self.sources)
 
     def with_calibrations(self, calibrations: Mapping[str, Calibration]) -> Self:
@@ -95,7 +95,7 @@ class CloudRecipe:
         return replace(self, sources=tuple(sources))
 
     def differences(self, other: "CloudRecipe") -> list[str]:
-        """How the cameras of another recipe for the same images differ from this one's, a line each; often none."""
+        """The differences between another recipe's cameras and this one's, for the same images, a line each."""
         lines = []
         for mine, others in zip(self.sources, other.sources, strict=True):
             a, b = mine.calibration, others.calibration

@@ -97,7 +97,7 @@ def fit_board(X_base_tool: Array, X_camera_board: Array, *, on_arm: bool) -> Fit
 
 
 def _second_axis(poses: Array) -> float:
-    """How far the poses (K, 4, 4) turn about the second most used axis, [deg]."""
+    """The angle by which the poses (K, 4, 4) turn about the second most used axis, [deg]."""
     import cv2
 
     relative = [poses[0, :3, :3].T @ pose[:3, :3] for pose in poses[1:]]

@@ -43,8 +43,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     horizon: int = within(4, least=1, most=1024)
     # Actions executed before the next prediction, from the current step on.
     n_action_steps: int = within(3, least=1, most=1024)
-    # How many points of a cloud the policy looks at, sampled farthest point by farthest point; null for all. A cloud
-    # in this order already, as those of this package's environments are, keeps its first ones.
+    # The number of a cloud's points that the policy sees, sampled farthest point by farthest point; null for all. A
+    # cloud in this order already, as those of this package's environments are, keeps its first ones.
     n_points: int | None = within(None, least=1)
 
     # Training from depth images, which become clouds.
@@ -62,8 +62,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # Features of a robot state (the baselines').
     n_state_features: int = within(64, least=1, most=8192)
 
-    # What computes actions, the same to rounding: eager (PyTorch, the reference), openvino or onnxruntime (on a CPU;
-    # faster for small networks; on other devices it is PyTorch), compile (torch.compile, on a GPU with CUDA graphs).
+    # The engine that computes actions, the same to rounding: eager (PyTorch, the reference), openvino or onnxruntime
+    # (on a CPU; faster for small networks; on other devices it is PyTorch), compile (torch.compile, on a GPU with CUDA
+    # graphs).
     # openvino_bfloat16 is faster still where the processor has bfloat16 instructions, UCA-Flow's actions within
     # about 2 % of their range (docs/inference.md).
     inference: str = "eager"

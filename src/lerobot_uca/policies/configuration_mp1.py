@@ -16,7 +16,7 @@ class MP1Config(UNetPolicyConfig):
 
     # Weight of the dispersive loss.
     dispersive_weight: float = within(0.5, least=0)
-    # Of the adaptive weight 1 / (D^2 + c)^(1/2).
+    # The constant c of the adaptive weight 1 / (D^2 + c)^(1/2).
     c: float = within(1e-3, above=0)
     # t and r are two draws from sigmoid(N(interval_mean, interval_std^2)).
     interval_mean: float = within(-0.4, least=-10, most=10)

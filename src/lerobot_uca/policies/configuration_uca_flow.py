@@ -32,7 +32,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # Interval tokens N_h; likewise.
     n_interval_tokens: int = within(4, least=1, most=1024)
 
-    # How conditions reach the actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
+    # How conditions reach actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
     # same size).
     conditioning: str = "unified"
     # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
@@ -40,7 +40,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
 
     # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
     dual_pass: bool = True
-    # Of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with 0.5 and 0.001 it is MP1's.
+    # The exponent of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with 0.5 and 0.001 it is MP1's.
     gamma: float = within(0.5, least=0, most=1)
     # See gamma.
     c: float = within(1e-3, above=0)

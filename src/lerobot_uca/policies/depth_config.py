@@ -1,4 +1,4 @@
-"""How a policy's cloud is made from a dataset's depth images, if it is: options, and what becomes of them."""
+"""Options for a policy's cloud from a dataset's depth images, and the recipe that they become."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +23,7 @@ from lerobot_uca.point_clouds.recipe import (
 class DepthConfig:
     """Training from depth images, and running on a robot that has them. Metres, in the robot's base frame."""
 
-    # Lowest corner of the crop: what lies outside is no part of the cloud. lerobot-uca-view helps to choose it.
+    # Lowest corner of the crop: points outside do not belong to the cloud. lerobot-uca-view helps to choose it.
     crop_low: tuple[float, float, float] | None = None
     # Highest corner of the crop.
     crop_high: tuple[float, float, float] | None = None
@@ -32,7 +32,7 @@ class DepthConfig:
     # Folder of the cameras' calibrations, for training; by default $LEROBOT_UCA_CALIBRATION, which also holds on the
     # robot.
     calibration: str | None = None
-    # How clouds were made in training; written by training, not for users.
+    # The recipe of training's clouds; written by training, not for users.
     recipe: dict[str, Any] | None = None
 
     def settle(self, features: Features) -> CloudRecipe | None:

@@ -91,7 +91,7 @@ def check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
 
 def check_values(name: str, value: Tensor) -> None:
     """Raise a `UserError` for NaN, infinite and huge values."""
-    # On a CPU NumPy looks: for 64 clouds PyTorch wakes a second thread, which then spins on a core the network needs.
+    # NumPy looks on a CPU: for 64 clouds PyTorch wakes a second thread, which then spins on a core the network needs.
     values: Any = value.detach().numpy() if value.device.type == "cpu" else value
     if values.min() >= -LARGEST and values.max() <= LARGEST:  # neither holds for NaN
         return

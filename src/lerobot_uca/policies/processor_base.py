@@ -95,7 +95,7 @@ def load_processors(
 def _check_pipelines(
     config: PointCloudPolicyConfig, checkpoint: str, pre: PolicyProcessorPipeline, post: PolicyProcessorPipeline
 ) -> None:
-    """Nothing may reach the policy or the robot unnormalised; old checkpoints get the point-cloud step."""
+    """Check that all data reaches the policy and the robot normalised. Old checkpoints get the point-cloud step."""
     for pipeline, kind, keys in (
         (pre, NormalizerProcessorStep, (OBS_POINT_CLOUD, OBS_STATE, ACTION)),
         (post, UnnormalizerProcessorStep, (ACTION,)),

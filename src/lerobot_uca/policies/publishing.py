@@ -1,4 +1,4 @@
-"""What a policy's page on the Hugging Face Hub says, and how a policy gets there."""
+"""A policy's page on the Hugging Face Hub, and its upload."""
 
 import time
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ N_TIMED = 20
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What the last evaluation of a training has found."""
+    """The result of the last evaluation of a training."""
 
     pc_success: float
     n_episodes: int

@@ -19,7 +19,7 @@ from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 logger = logging.getLogger(__name__)
 
 Statistics = dict[str, dict[str, NDArray[np.float64]]]
-"""By feature and name (min, max, mean, std, q01, ...), each (D,)."""
+"""Statistics by feature and name (min, max, mean, std, q01, ...), each (D,)."""
 
 MIN_RANGE = 1e-4
 """A range below it, in the feature's unit, counts as constant, as in DP3 and the other baselines ..."""
@@ -31,7 +31,7 @@ BOUNDS = {
     NormalizationMode.QUANTILES: ("q01", "q99"),
     NormalizationMode.QUANTILE10: ("q10", "q90"),
 }
-"""What becomes -1 and 1."""
+"""The statistics that become -1 and 1."""
 NEEDED = {**BOUNDS, NormalizationMode.MEAN_STD: ("mean", "std"), NormalizationMode.IDENTITY: ()}
 
 

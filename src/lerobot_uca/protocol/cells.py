@@ -1,4 +1,4 @@
-"""What there is to train: a cell is one policy on one task with one training seed."""
+"""The cells of a benchmark: a cell is one policy on one task with one training seed."""
 
 from collections.abc import Collection, Mapping
 from difflib import get_close_matches
@@ -68,7 +68,7 @@ class Cell(NamedTuple):
     seed: int
 
     def __str__(self) -> str:
-        """As progress lines and errors name it."""
+        """The name in progress lines and errors."""
         return f"{self.task} {self.policy} seed {self.seed}"
 
     @property

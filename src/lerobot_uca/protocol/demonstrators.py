@@ -35,7 +35,7 @@ class Trial(NamedTuple):
 
 
 class Demonstrator(NamedTuple):
-    """How an expert does on a task: a row of the table."""
+    """An expert's results on a task: a row of the table."""
 
     task: str
     smoothing: float
@@ -45,7 +45,7 @@ class Demonstrator(NamedTuple):
     any_success: int
     """Episodes with a successful step."""
     roughness: float
-    """Of the demonstrations, the median."""
+    """The median roughness of the demonstrations."""
     first_seed: int
     mujoco: str
     """Version."""

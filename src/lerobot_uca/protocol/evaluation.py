@@ -32,7 +32,7 @@ Plan = Callable[[list["Running"]], NDArray[np.float32]]
 
 
 class Episode(NamedTuple):
-    """How an episode went."""
+    """The result of an episode."""
 
     seed: int
     success: bool
@@ -61,7 +61,7 @@ class Running:
         self._observed: dict[int, Observation] = {0: observation}  # by step
 
     def history(self) -> list[Observation]:
-        """What the policy looks at now, oldest first; the first observation stands for those before it."""
+        """The policy's present observations, oldest first; the first observation stands for those before it."""
         return [self._observed[max(0, self._length + delta)] for delta in self._deltas]
 
     def execute(self, actions: NDArray[np.float32]) -> None:
@@ -82,7 +82,7 @@ class Running:
         self.seconds += time.perf_counter() - begin
 
     def result(self) -> Episode:
-        """How it went."""
+        """The episode's result."""
         return Episode(self.seed, self.success, self._total, self._length, 1e3 * self.seconds / self._length)
 
     def _is_looked_at(self, step: int) -> bool:

@@ -103,7 +103,7 @@ class RunFolder:
 
     @contextmanager
     def demonstrations(self, cell: Cell) -> Iterator[Path]:
-        """Where a task's dataset is or belongs, for one process at a time."""
+        """The folder of a task's dataset, there or not yet, for one process at a time."""
         folder = self.path / "demonstrations" / cell.task
         folder.parent.mkdir(parents=True, exist_ok=True)
         with _locked(folder.with_name(f".{folder.name}.lock"), fcntl.LOCK_EX):
@@ -122,7 +122,7 @@ class RunFolder:
             yield from read_rows(path)
 
     def records(self) -> Iterator[dict[str, Any]]:
-        """What was recorded of each finished cell."""
+        """The record of each finished cell."""
         for path in self.path.glob("cells.json"):
             yield from _read_json(path)["cells"]
         for path in sorted(self.path.glob("cells/*/*/*/*/cell.json")):

@@ -14,7 +14,7 @@ Z_95 = 1.959963984540054  # of the standard normal distribution
 N_DRAWS = 4000
 
 Successes = Sequence[NDArray[np.int64]]
-"""For each training seed of a task, (N,): 1 for a success, 0 for a failure; or differences of two policies."""
+"""Episodes of each training seed of a task, (N,): 1 a success, 0 a failure; or differences of two policies."""
 
 
 class Estimate(NamedTuple):

@@ -1,4 +1,4 @@
-"""How long a policy takes for a chunk of actions: one sample, after the observation is there."""
+"""A policy's time for a chunk of actions: one sample, after the observation is there."""
 
 import time
 from contextlib import redirect_stdout

@@ -1,4 +1,4 @@
-"""Where cells run. A launcher takes cells and yields how each has ended, as they end."""
+"""Launchers run cells. A launcher takes cells and yields the end of each, as they end."""
 
 import logging
 import os
@@ -26,16 +26,16 @@ POLL_SECONDS = 0.5
 
 
 class Ended(NamedTuple):
-    """How a cell's process has ended: an `Outcome`, or another exit code if it crashed or was killed."""
+    """The end of a cell's process: an `Outcome`, or another exit code if it crashed or was killed."""
 
     cell: Cell
     returncode: int
     reason: str | None = None
-    """Why the launcher has given it up, if it has."""
+    """The reason why the launcher has given it up, if it has."""
 
 
 Launcher = Callable[[Path, Sequence[Cell], str | None], Iterator[Ended]]
-"""From the folder, the cells and Adroit's expert to how each has ended."""
+"""Maps the folder, the cells and Adroit's expert to the end of each cell."""
 
 
 def run_process(folder: Path, cell: Cell, expert: str | None) -> int:
@@ -50,7 +50,7 @@ def _start(folder: Path, cell: Cell, expert: str | None) -> "subprocess.Popen[by
 
 
 def local(n_parallel: int) -> Launcher:
-    """On this machine, so many cells at once. They end when the launcher is left, with Ctrl-C for example."""
+    """Run so many cells at once on this machine. They end when the launcher is left, with Ctrl-C for example."""
 
     def launch(folder: Path, cells: Sequence[Cell], expert: str | None) -> Iterator[Ended]:
         waiting = deque(cells)
@@ -73,7 +73,7 @@ def local(n_parallel: int) -> Launcher:
 
 
 def on_ray(address: str) -> Launcher:
-    """On a Ray cluster whose nodes share the disk. A cell whose node dies is begun anew on another, where it goes on.
+    """Run on a Ray cluster whose nodes share the disk. A cell whose node dies is begun anew on another and goes on.
 
     Raises:
         UserError: if Ray is not installed, or the address does not answer.
@@ -114,7 +114,7 @@ def _connect(ray: Any, address: str) -> None:
 
 
 def on_slurm(options: Mapping[str, str], cluster: str = "slurm") -> Launcher:
-    """As a Slurm array, one task a cell, through submitit. The nodes share the disk.
+    """Run as a Slurm array, one task a cell, through submitit. The nodes share the disk.
 
     Args:
         options: of sbatch, by their long names: partition, time, gres, ...

@@ -13,7 +13,7 @@ class Printed(NamedTuple):
 
 
 COLUMNS = ("hammer", "door", "pen", "easy", "medium", "hard", "very_hard", "average")
-"""Of Tables 1 and 2: three tasks of Adroit, four groups of Meta-World, and the mean over 37 tasks."""
+"""Columns of Tables 1 and 2: three tasks of Adroit, four groups of Meta-World, and the mean over 37 tasks."""
 
 
 def _row(*numbers: tuple[float, float]) -> dict[str, Printed]:
@@ -52,7 +52,7 @@ MILLISECONDS = {
 """Table 2: inference [ms] on an RTX A5000."""
 
 NETWORK_CALLS = {"dp3": 10, "simple_dp3": 10, "flowpolicy": 1, "mp1": 1, "uca_flow": 1}
-"""For a chunk of actions."""
+"""Network calls for a chunk of actions."""
 
 _ABLATION = {
     "uca_flow": (

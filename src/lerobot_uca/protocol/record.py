@@ -1,4 +1,4 @@
-"""What a result was made with: versions, commit, hardware."""
+"""The origin of a result: versions, commit, hardware."""
 
 import importlib.metadata
 import os

@@ -47,7 +47,7 @@ class Results:
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> tuple[Self, list[CorruptRow]]:
-        """What folders hold, and the lines in them that are not rows.
+        """The results in folders, and the lines in them that are not rows.
 
         Raises:
             UserError: if a path is not a run's folder, or they were made with different settings.
@@ -79,7 +79,7 @@ class Results:
     # The honest rule: the last checkpoint, fresh episodes. ------------------------------------------------------
 
     def successes(self, task: str, policy: str) -> Successes:
-        """Of the last checkpoints' fresh episodes, for each training seed."""
+        """The last checkpoints' successes in fresh episodes, for each training seed."""
         return [
             np.array([int(success) for success in self._final[Cell(task, policy, seed)].values()])
             for seed in self.seeds(task, policy)
@@ -96,7 +96,7 @@ class Results:
         return mean_over_tasks(there)
 
     def difference(self, policy: str, other: str, tasks: Sequence[str]) -> tuple[Estimate, list[str]] | None:
-        """How much more of the same episodes a policy succeeds in than another, on the tasks both have, and those.
+        """The difference of two policies' success in the same episodes, on the tasks both have, and those tasks.
 
         Paired by task, training seed and episode.
         """
@@ -148,7 +148,7 @@ class Results:
         return (float(np.mean(times)), float(np.std(times))) if times else None
 
     def hardware(self) -> list[str]:
-        """What the cells ran on."""
+        """The hardware that the cells ran on."""
         kinds = {json.dumps(record["hardware"], sort_keys=True): record["hardware"] for record in self.records.values()}
         return [
             f"{each['gpu'] or each['cpu']} ({each['cores']} cores, {each['threads']} thread a cell)"

@@ -15,7 +15,7 @@ class Row(NamedTuple):
     task: str
     policy: str
     seed: int
-    """Of the training."""
+    """The training's seed."""
     step: int
     """Training steps before this evaluation."""
     epoch: float
@@ -33,7 +33,7 @@ class Row(NamedTuple):
 
     @property
     def cell(self) -> Cell:
-        """Whose episode it is."""
+        """The cell of the episode."""
         return Cell(self.task, self.policy, self.seed)
 
     @classmethod
@@ -81,7 +81,7 @@ class CorruptRow(NamedTuple):
     reason: str
 
     def __str__(self) -> str:
-        """As a warning names it."""
+        """The line's name in a warning."""
         return f"{self.path}, line {self.line} is left out: {self.reason}."
 
 

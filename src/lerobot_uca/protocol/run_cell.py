@@ -32,7 +32,7 @@ N_ENVS = 10
 
 
 class Outcome(IntEnum):
-    """How a cell's process ends: its exit code."""
+    """The exit codes of a cell's process."""
 
     FINISHED = 0
     FAILED = 1
@@ -94,7 +94,7 @@ def _evaluate(folder: RunFolder, cell: Cell, dataset: Path) -> None:
 
 
 def _load_lerobot() -> None:
-    """Not before it is needed: during the training its memory is the training's."""
+    """Load LeRobot only when it is needed: during the training its memory is the training's."""
     import torch
     from lerobot.utils.import_utils import register_third_party_plugins
 

@@ -1,4 +1,4 @@
-"""How cells are trained and evaluated: a YAML file, by name those of this package's folder `settings`."""
+"""Settings for training and evaluating cells: a YAML file, or the name of one in this package's folder `settings`."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -16,12 +16,12 @@ FOLDER = files("lerobot_uca.protocol") / "settings"
 FIRST_TUNING_SEED = 100
 """Training seeds from here on are for choosing a setting. Their episodes are others than those of the tables."""
 INTERIM_SEEDS, FINAL_SEEDS, TUNING_OFFSET = 2_000_000, 4_000_000, 10_000_000
-"""Where the seeds of evaluation episodes start. Demonstrations start at 1 million, LeRobot's evaluations at 1000."""
+"""The first seeds of evaluation episodes. Demonstrations start at 1 million, LeRobot's evaluations at 1000."""
 
 
 @dataclass(frozen=True)
 class Length:
-    """How long a task is trained, and how often it is evaluated meanwhile."""
+    """The length of a task's training, and the evaluations meanwhile."""
 
     steps: int
     evaluations: int
@@ -38,16 +38,16 @@ class Setting:
     """All that decides a cell's result besides task, policy and seed."""
 
     name: str
-    """Of the file, without its ending."""
+    """The file's name without its ending."""
     description: str
     """One line, printed with every table."""
     batch_size: int
     lengths: Mapping[str, Length]
-    """By 'benchmark' or 'benchmark/task'; the latter counts where both are there."""
+    """Lengths by 'benchmark' or 'benchmark/task'; the latter counts where both are there."""
     demonstrations: int = 10
     """Expert episodes of a task."""
     smoothing: Mapping[str, float] = field(default_factory=dict)
-    """Of experts' actions, by task, as for lerobot-uca-collect."""
+    """The smoothing of experts' actions by task, as for lerobot-uca-collect."""
     interim_episodes: int = 20
     """Episodes of each evaluation during training."""
     final_episodes: int = 100
@@ -76,7 +76,7 @@ class Setting:
 
     @classmethod
     def from_values(cls, name: str, values: Any) -> Self:
-        """From what a YAML file holds."""
+        """Make a setting of a YAML file's values."""
         valid = [each.name for each in fields(cls) if each.name != "name"]
         if not isinstance(values, dict) or not set(values) <= set(valid):
             got = ", ".join(map(str, values)) if isinstance(values, dict) else type(values).__name__
@@ -116,11 +116,11 @@ class Setting:
                 )
 
     def as_values(self) -> dict[str, Any]:
-        """As plain values, for JSON."""
+        """The setting as plain values, for JSON."""
         return asdict(self)
 
     def length(self, cell: Cell) -> Length:
-        """How long a cell is trained."""
+        """The length of a cell's training."""
         for key in (cell.task, cell.benchmark):
             if key in self.lengths:
                 return self.lengths[key]

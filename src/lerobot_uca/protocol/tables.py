@@ -25,14 +25,14 @@ class Table:
     """Text in rows and columns."""
 
     name: str
-    """Of its files."""
+    """The name of its files."""
     title: str
     caption: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
 
     def markdown(self) -> str:
-        """With its title and caption."""
+        """The table in Markdown, with its title and caption."""
         lines = [" | ".join(row) for row in (self.header, ["---"] * len(self.header), *self.rows)]
         table = "\n".join(f"| {line} |" for line in lines)
         return f"### {self.title}\n\n{table}\n\n{self.caption}\n"
@@ -44,7 +44,7 @@ class Table:
         return file.getvalue()
 
     def latex(self) -> str:
-        """For booktabs."""
+        """The table in LaTeX, for booktabs."""
         lines = [" & ".join(map(_latex, row)) + r" \\" for row in (self.header, *self.rows)]
         return "\n".join(
             [
@@ -63,7 +63,7 @@ class Table:
         )
 
     def html(self) -> str:
-        """As a section."""
+        """The table as a section of HTML."""
         head, *body = (
             "".join(f"<{kind}>{html.escape(text)}</{kind}>" for text in row)
             for kind, row in [("th", self.header), *(("td", row) for row in self.rows)]
@@ -93,7 +93,7 @@ TITLES = {
 
 
 def setting_of(results: Results) -> str:
-    """What a table's caption says of how it was made."""
+    """The part of a table's caption that names its setting."""
     setting = results.setting
     ran_on = "; ".join(results.hardware())
     return f"Setting '{setting.name}': {setting.description}.{f' Made on: {ran_on}.' if ran_on else ''}"
@@ -152,7 +152,7 @@ def inference_table(results: Results) -> Table:
 
 
 def difference_table(results: Results) -> Table:
-    """Which orders hold."""
+    """The orders of policies that hold."""
     first, *others = results.policies or ["uca_flow"]
     rows = []
     for other in others:

@@ -20,7 +20,7 @@ LOG_TAIL = 2000  # characters in which a failing command has said why
 
 
 class CellError(Exception):
-    """Why a cell has failed, in one line. The other cells go on."""
+    """The reason why a cell has failed, in one line. The other cells go on."""
 
 
 class NoSpaceError(Exception):
@@ -142,7 +142,7 @@ def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | 
 
 
 def ended(returncode: int) -> str:
-    """How a process has ended, in words."""
+    """The end of a process, in words."""
     if returncode >= 0:
         return f"ended with exit code {returncode}"
     name = signal.Signals(-returncode).name

@@ -77,7 +77,7 @@ class CalibrateConfig:
     on_arm: bool = False
     # Metres a unit of the camera's depth images.
     depth_unit: float = MILLIMETRE
-    # Where calibrations are kept.
+    # The folder of calibrations.
     folder: Path = DEFAULT_FOLDER
 
 

@@ -29,7 +29,7 @@ N_MOMENTS = 4
 
 
 class Moments(NamedTuple):
-    """What a policy sees and does at K moments of an episode."""
+    """A policy's observations and actions at K moments of an episode."""
 
     steps: list[int]
     points: NDArray[np.float32]  # (K, N, 3) [m], the newest frame's
@@ -39,7 +39,7 @@ class Moments(NamedTuple):
 
 
 def saliency(policy: PointCloudPolicy, cloud: Tensor, state: Tensor, noise: Tensor) -> Tensor:
-    """How much each point of the newest frame decides the predicted chunk, (B, N).
+    """The influence of each point of the newest frame on the predicted chunk, (B, N).
 
     It is the length of the gradient of the chunk's squared length with respect to the point. The paper shows such
     pictures without saying of which number the gradient is.

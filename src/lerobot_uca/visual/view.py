@@ -60,7 +60,7 @@ class ViewConfig:
     output: Path | None = None
     # Write a recording for Rerun instead.
     rrd: Path | None = None
-    # Of the page, on this machine only.
+    # The page's port, on this machine only.
     port: int = within(8080, least=1, most=65535)
 
 

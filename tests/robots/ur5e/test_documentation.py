@@ -28,7 +28,7 @@ TINY = {
     "lerobot-rollout": ["--duration=1", "--return_to_initial_position=false"],
     "lerobot-replay": [],
 }
-"""What makes a command tiny."""
+"""Arguments that make a command tiny."""
 
 
 def commands() -> list[list[str]]:

@@ -102,7 +102,7 @@ def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path
 
 
 def distance_to_path(points, path):
-    """Of each point to the nearest place on a path of straight pieces, in the largest coordinate."""
+    """The distance of each point to a path of straight pieces, in the largest coordinate."""
     start, way = path[:-1], np.diff(path, axis=0)
     length = np.maximum((way**2).sum(axis=1), 1e-12)
     share = np.clip(np.einsum("psj,sj->ps", points[:, None] - start, way) / length, 0, 1)

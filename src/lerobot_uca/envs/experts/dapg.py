@@ -16,7 +16,7 @@ from lerobot_uca.point_clouds.geometry import Array
 
 Weights = NDArray[np.float32]
 
-# What reading a file raises that is damaged or made to do harm.
+# The errors from reading a file that is damaged or made to do harm.
 DAMAGE = (
     *(AttributeError, EOFError, LookupError, MemoryError, OverflowError, RecursionError, RuntimeError, TypeError),
     *(ValueError, pickle.UnpicklingError, struct.error, zipfile.BadZipFile),
@@ -42,7 +42,7 @@ class DAPGWeights(NamedTuple):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """From an `.npz` file with these names, or from an original pickle.
+        """Read an `.npz` file with these names, or an original pickle.
 
         Raises:
             UserError: if the file is missing or does not contain a DAPG policy.

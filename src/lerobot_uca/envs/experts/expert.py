@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lerobot_uca.errors import UserError
 
 Expert = Callable[[Any], NDArray[np.float32]]
-"""From an environment to the action that a demonstrator would take in its present state."""
+"""Maps an environment to the action that a demonstrator would take in its present state."""
 
 
 class Attempt(NamedTuple):

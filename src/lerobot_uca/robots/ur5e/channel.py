@@ -27,7 +27,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Target:
-    """To the arm: where to go, and in what time at the earliest."""
+    """A message to the arm: the target, and the time to it at the least."""
 
     q: tuple[float, ...]  # (6,) [rad]
     duration: float  # [s]
@@ -35,12 +35,12 @@ class Target:
 
 @dataclass(frozen=True)
 class Stop:
-    """To the arm: brake, end the program and the process."""
+    """A message to the arm: brake, end the program and the process."""
 
 
 @dataclass(frozen=True)
 class State:
-    """From the arm, with every tick of the servo loop: the heartbeat."""
+    """A message from the arm with every tick of the servo loop: the heartbeat."""
 
     timestamp: float  # [s], the controller's
     q: tuple[float, ...]  # (6,) [rad], measured
@@ -53,14 +53,14 @@ class State:
 
 @dataclass(frozen=True)
 class Note:
-    """From the arm: something to tell the user."""
+    """A message from the arm to tell the user."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Failure:
-    """From the arm, the last message: it stands still, and why."""
+    """The last message from the arm: it stands still, and why."""
 
     text: str
 

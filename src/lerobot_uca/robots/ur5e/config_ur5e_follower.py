@@ -58,7 +58,7 @@ class UR5eFollowerConfig(RobotConfig):
 
     @property
     def limits(self) -> JointLimits:
-        """What holds for every caller."""
+        """The limits that hold for every caller."""
         return JointLimits(
             lower=tuple(self.lower),
             upper=tuple(self.upper),

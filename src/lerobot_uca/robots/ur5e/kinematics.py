@@ -18,7 +18,7 @@ D = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)  # [m]
 ALPHA = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)  # [rad]
 
 DAMPING = 1e-3
-"""Of the least squares; keeps steps finite near singular poses."""
+"""Damping of the least squares; it keeps steps finite near singular poses."""
 
 
 def _link_poses(q: ArrayLike) -> Array:
@@ -40,14 +40,14 @@ def flange_pose(q: ArrayLike) -> Array:
 
 
 def jacobian(q: ArrayLike) -> Array:
-    """Of the flange, (6, 6): velocity [m/s] over angular velocity [rad/s], base frame, for each joint's [rad/s]."""
+    """The flange's Jacobian (6, 6): velocity [m/s] over angular velocity [rad/s], base frame, by joint [rad/s]."""
     poses = _link_poses(q)
     axes, origins = poses[:-1, :3, 2], poses[:-1, :3, 3]
     return np.vstack([np.cross(axes, poses[-1, :3, 3] - origins).T, axes.T])
 
 
 def inverse_kinematics(target: Array, seed: ArrayLike, *, n_steps: int = 30, tolerance: float = 1e-6) -> Array | None:
-    """Joint angles (6,) near the seed at which the flange has the target's pose, or None where there are none.
+    """Joint angles (6,) near the seed at which the flange has the target's pose, or None if none are found.
 
     Damped Gauss-Newton steps: the solution stays in the seed's branch (elbow up stays elbow up).
 
@@ -110,7 +110,7 @@ def rotation_matrix(vector: Array) -> Array:
 
 def rotation_vector(R: Array) -> Array:
     """Axis times angle (3,) [rad], angle in [0, pi], of a rotation (3, 3)."""
-    # By way of the quaternion, which is exact at pi, too.
+    # The quaternion is exact at pi, too.
     # The largest of the four ways to start divides by no small number.
     w = 1 + R[0, 0] + R[1, 1] + R[2, 2]
     diagonal = 1 + 2 * np.diag(R) - np.trace(R)

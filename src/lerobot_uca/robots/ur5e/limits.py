@@ -9,7 +9,7 @@ from lerobot_uca.robots.ur5e.kinematics import Array
 
 @dataclass(frozen=True)
 class JointLimits:
-    """What holds for every caller."""
+    """The limits that hold for every caller."""
 
     lower: tuple[float, ...]  # (6,) [rad]
     upper: tuple[float, ...]  # (6,) [rad]

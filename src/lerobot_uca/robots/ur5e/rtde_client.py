@@ -2,7 +2,7 @@
 
 ur_rtde runs here and nowhere else. Of its release 1.6.5 this was measured: it dies of a segmentation fault when
 RTDE's stream breaks while the controller still accepts connections; `servoJ` answers True while the arm is stopped or
-gone and takes targets that are no numbers or too few; its getters repeat the last values for ever. So this loop checks
+gone and takes targets that are not numbers or too few; its getters repeat the last values for ever. So this loop checks
 connection, age of the data, program and safety before every command, sends checked targets only, and leaves at once,
 without ur_rtde's own cleaning up, where something is wrong.
 """
@@ -46,7 +46,7 @@ class Channel:
         self._received = b""
 
     def receive(self) -> list[Message]:
-        """What has come. A driver that is gone is a `Stop`."""
+        """The messages that have come. A driver that is gone is a `Stop`."""
         self._socket.setblocking(False)
         try:
             while data := self._socket.recv(65536):

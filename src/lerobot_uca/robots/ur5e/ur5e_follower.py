@@ -62,7 +62,7 @@ class UR5eFollower(Robot):
 
     @cached_property
     def _keys(self) -> tuple[str, ...]:
-        """Of states and actions alike."""
+        """The keys of states and actions alike."""
         keys = JOINT_KEYS if self.config.action == "joints" else TCP_KEYS
         return keys if self.config.gripper == "none" else (*keys, GRIPPER_KEY)
 
@@ -254,7 +254,7 @@ class ClippingReport:
         self._n = 0
 
     def note(self, clipped: Array) -> None:
-        """What was taken away from a target, (6,) [rad]."""
+        """Note the part that was taken away from a target, (6,) [rad]."""
         if np.abs(clipped).max() > NOTICEABLE:
             self._n += 1
             self._largest = np.maximum(self._largest, np.abs(clipped))

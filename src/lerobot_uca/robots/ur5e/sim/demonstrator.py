@@ -26,7 +26,7 @@ FINGERS = 0.02  # [m], how thick closed fingers are where they push, from their 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Where the tool, pointing down, is to be, and what the gripper then does."""
+    """A pose of the tool, which points down, and the gripper's action there."""
 
     position: tuple[float, float, float]  # [m], base frame
     yaw: float = 0.0  # [rad], about the base's z axis, from the tool's direction at home
@@ -93,7 +93,7 @@ def way_home(q: Array, rate: float, speed: float = 0.6) -> Array:
 
 
 def _eased(share: float) -> float:
-    """From 0 to 1 with a gentle start and end."""
+    """A share from 0 to 1 with a gentle start and end."""
     return share * share * (3 - 2 * share)
 
 

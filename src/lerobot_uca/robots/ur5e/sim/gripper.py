@@ -7,7 +7,7 @@ FASTEST, SLOWEST = 390.0, 52.0  # [counts/s]: 85 mm at 150 and at 20 mm/s
 
 
 class Fingers(Protocol):
-    """What closes. Positions in counts: 0 open, 255 closed."""
+    """The fingers that close. Positions in counts: 0 open, 255 closed."""
 
     @property
     def count(self) -> float:
@@ -20,7 +20,7 @@ class Fingers(Protocol):
 
 
 class IdealFingers:
-    """Nothing between them."""
+    """Fingers with nothing between them."""
 
     def __init__(self) -> None:
         self.count = float(OPEN_COUNT)
@@ -51,7 +51,7 @@ class SimulatedGripper:
             self._registers[name] = value
 
     def get(self, name: str) -> int:
-        """What a register shows."""
+        """The value of a register."""
         if name == "POS":
             return round(min(max(self._fingers.count, 0), 255))
         if name == "STA":

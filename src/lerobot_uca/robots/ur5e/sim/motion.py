@@ -17,7 +17,7 @@ JOINT_RANGE = 2 * np.pi  # [rad], to either side, every joint of a UR5e
 
 
 class Motion(Protocol):
-    """What the arm is doing."""
+    """A motion of the arm."""
 
     is_done: bool
 

@@ -72,7 +72,7 @@ class Recipe:
 
     @classmethod
     def parse(cls, text: bytes, known: dict[str, str]) -> "Recipe":
-        """From a request's names; an unknown one gets the type NOT_FOUND."""
+        """Make a recipe of a request's names; an unknown one gets the type NOT_FOUND."""
         names = tuple(name for name in text.decode("ascii").split(",") if name)
         return cls(names, tuple(known.get(name, "NOT_FOUND") for name in names))
 
@@ -83,7 +83,7 @@ class Recipe:
 
     @property
     def layout(self) -> struct.Struct:
-        """Of the values in a packet."""
+        """The layout of the values in a packet."""
         return struct.Struct(">" + "".join(FORMATS[each] for each in self.types))
 
     def reply(self, recipe_id: int) -> bytes:

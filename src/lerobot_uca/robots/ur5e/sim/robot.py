@@ -64,7 +64,7 @@ READY, DONE = 1, 2  # output register 0
 
 
 class Arm(Protocol):
-    """What the controller moves."""
+    """The arm that the controller moves."""
 
     @property
     def q(self) -> Array:
@@ -125,7 +125,7 @@ class Robot:
     # The program.
 
     def start_program(self) -> None:
-        """As a script arrives whole. A stopped arm starts none."""
+        """Start a program whose script has arrived whole. A stopped arm starts none."""
         if self.safety == Safety.NORMAL:
             self.runtime = Runtime.PLAYING
             self._executing, self._acknowledged, self._watchdog = None, False, None
@@ -209,7 +209,7 @@ class Robot:
             self._executing = blocking
 
     def _write_progress(self, *, running: bool) -> None:
-        """Of an asynchronous move, for `getAsyncOperationProgress`."""
+        """Write an asynchronous move's progress, for `getAsyncOperationProgress`."""
         if running:
             self._operation = (self._operation + 1) % 128
         count = (int(self.outputs.get("output_int_register_2", 0)) >> 16) + 1 & 127  # type: ignore[arg-type]
@@ -222,7 +222,7 @@ class Robot:
         self._stop(Safety.PROTECTIVE_STOP, reason)
 
     def emergency_stop(self) -> None:
-        """As if somebody had pressed the button."""
+        """Stop as if somebody had pressed the button."""
         self._stop(Safety.ROBOT_EMERGENCY_STOP, "emergency stop")
 
     def _stop(self, safety: Safety, reason: str) -> None:
@@ -288,7 +288,7 @@ class Robot:
 
 
 def _violation(q: Array, qd: Array) -> str:
-    """Why the safety system stops an arm that is to go there; empty where it does not."""
+    """The reason why the safety system stops an arm that is to go there; empty if it does not."""
     if not (np.isfinite(q).all() and np.isfinite(qd).all()):
         return "a joint target is not a number"
     if np.abs(qd).max() > MAX_VELOCITY * 1.001:

@@ -1,4 +1,4 @@
-"""What a simulated world offers beside its controller: depth frames, the things' poses, resets and faults.
+"""The services of a simulated world beside its controller: depth frames, the things' poses, resets and faults.
 
 Port 30010 of the controller's address. A request is a line of JSON, the reply too; after that of `frame` come the
 images' bytes: depth (H, W) uint16 [mm], 0 where nothing was measured, then colour (H, W, 3) uint8 if it was asked for.
@@ -47,7 +47,7 @@ def simulated_camera(width: int, height: int, name: str = "top") -> Camera:
 
 @dataclass(frozen=True)
 class Noise:
-    """Of a real depth camera's kind."""
+    """Noise like a real depth camera's."""
 
     deviation: float = 0.0  # standard deviation at a distance of 1 m [m]; it grows with the square of the distance
     holes: float = 0.0  # share of the pixels without depth, besides those at edges

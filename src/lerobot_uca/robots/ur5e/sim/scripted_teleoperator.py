@@ -46,7 +46,7 @@ class ScriptedTeleoperator(Teleoperator):
 
     @property
     def action_features(self) -> dict[str, type]:
-        """As the robot's."""
+        """The same as the robot's."""
         return dict.fromkeys((*JOINT_KEYS, GRIPPER_KEY), float)
 
     @property

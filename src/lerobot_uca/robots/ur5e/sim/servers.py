@@ -58,7 +58,7 @@ class Server(socketserver.ThreadingTCPServer):
                 connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """As if the machine had been switched off."""
+        """Close as if the machine had been switched off."""
         self.shutdown()
         self.server_close()
         self.drop_connections()
@@ -133,12 +133,12 @@ class Rtde:
             self._arriving.append((time.monotonic() + self._network.latency, values))
 
     def deliver(self) -> None:
-        """What clients have sent and the network has carried. Called before each cycle, with the lock."""
+        """Deliver the clients' data that the network has carried. Called before each cycle, with the lock."""
         while self._arriving and self._arriving[0][0] <= time.monotonic():
             self._robot.receive(self._arriving.popleft()[1])
 
     def send_state(self) -> None:
-        """To every client that has started its stream. Called after each cycle, with the lock."""
+        """Send to every client that has started its stream. Called after each cycle, with the lock."""
         streams = [each for each in tuple(self._streams.values()) if self._robot.n_cycles % each.every == 0]
         if not streams:
             return

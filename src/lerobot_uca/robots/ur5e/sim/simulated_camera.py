@@ -16,7 +16,7 @@ FIRST_FRAME = 10.0  # [s]
 
 
 class Frame(NamedTuple):
-    """What the camera saw."""
+    """A frame that the camera saw."""
 
     received: float  # [s], this machine's monotonic clock
     time: float  # [s], the simulated world's
@@ -106,7 +106,7 @@ class SimulatedCamera(Camera):
             return self._frame
 
     def read(self) -> NDArray[Any]:
-        """The next colour frame (H, W, 3), or depth where there is no colour."""
+        """The next colour frame (H, W, 3), or depth from a camera without colour."""
         return self.async_read(1000)
 
     @check_if_not_connected
@@ -117,7 +117,7 @@ class SimulatedCamera(Camera):
 
     @check_if_not_connected
     def read_latest(self, max_age_ms: int = 500) -> NDArray[Any]:
-        """The newest colour frame (H, W, 3), or depth where there is no colour."""
+        """The newest colour frame (H, W, 3), or depth from a camera without colour."""
         frame = self._latest(max_age_ms)
         return frame.depth if frame.colour is None else frame.colour
 
