@@ -1,4 +1,4 @@
-"""What an evaluation records can be trained on."""
+"""A policy can be trained on what an evaluation records."""
 
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset

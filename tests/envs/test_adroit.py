@@ -211,7 +211,7 @@ def test_the_expert_succeeds(task, success, adroit_experts):
 # Bad input ----------------------------------------------------------------------------------------------------------
 
 
-def test_settings_that_are_none():
+def test_invalid_settings():
     with pytest.raises(UserError, match=r"Unknown task 'doors'\. Adroit tasks: door, .*; groups: paper, all\."):
         make_env_config("adroit_pointcloud", task="doors").create_envs(1)
     with pytest.raises(UserError, match=r"env\.success must be one of final, any, got 'last'"):

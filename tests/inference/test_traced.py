@@ -89,7 +89,7 @@ def test_pytorch_steps_in_with_float32_under_autocast(runtime, monkeypatch):
     "BF16" not in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"),
     reason="the processor has no bfloat16 instructions",
 )
-def test_bfloat16_is_what_it_says():
+def test_bfloat16_rounds_but_computes_the_same():
     network, x = make_network(), torch.randn(2, 3)
     with torch.no_grad():
         error = (BFloat16Function(call)(network, x)[0] - network(x)).abs().max()

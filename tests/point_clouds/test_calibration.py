@@ -70,7 +70,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("changes", "message"), WRONG.values(), ids=WRONG)
-def test_a_calibration_that_cannot_be_right_is_refused_by_file(tmp_path, changes, message):
+def test_an_invalid_calibration_is_refused_by_file(tmp_path, changes, message):
     file = tmp_path / "123456.yaml"
     file.write_text(yaml.safe_dump({**calibration().as_dict(), **changes}))
     with pytest.raises(CalibrationError, match=message) as error:

@@ -66,7 +66,7 @@ def test_what_varies_is_stretched_as_ever():
     assert pre(batch(action=torch.full((N_ACTIONS,), 5.0001)))[ACTION][0, 0].item() == pytest.approx(1, abs=0.01)
 
 
-def test_rounding_of_a_large_constant_is_no_range():
+def test_rounding_of_a_large_constant_does_not_count_as_a_range():
     values = column(1e6, n=N_STATES).astype(np.float32)
     values[::2, 0] = np.nextafter(np.float32(1e6), np.float32(2e6))
     pre, _ = processors(statistics(STATE, values.astype(np.float64)))
@@ -122,7 +122,7 @@ def test_a_feature_without_statistics(key):
 @pytest.mark.parametrize(
     ("values", "message"), [(np.zeros(3), "must be 4 numbers"), (np.full(4, np.nan), "must be finite")]
 )
-def test_statistics_that_cannot_be_right(values, message):
+def test_invalid_statistics(values, message):
     stats = make_statistics()
     stats[ACTION]["max"] = values
     with pytest.raises(UserError, match=f"'max' of 'action' in the dataset's .* {message}"):

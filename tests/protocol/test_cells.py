@@ -45,7 +45,7 @@ def test_the_whole_grid_is_888_trainings():
         (("paper", None, "uca_flow", "-1"), "--seeds must be at least 0"),
     ],
 )
-def test_names_that_there_are_not(arguments, message):
+def test_unknown_names(arguments, message):
     with pytest.raises(UserError) as caught:
         grid(*arguments)
     assert message in str(caught.value)

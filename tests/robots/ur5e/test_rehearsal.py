@@ -170,7 +170,7 @@ def test_a_camera_without_a_world_is_said():
         camera.connect()
 
 
-def test_a_request_that_is_none_is_answered(world):
+def test_an_invalid_request_is_answered(world):
     address, _ = world
     scene = SceneClient(address)
     with pytest.raises(ConnectionError, match="got 'dance'"):

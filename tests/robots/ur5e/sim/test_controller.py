@@ -209,7 +209,7 @@ def test_only_loopback_addresses_are_served():
 
 
 @pytest.mark.parametrize("data", [b"\x00\x00\x00", b"\x00\x02U", b"\xff\xffU", b"\x00\x04U\x09", b"\x00\x05U\x01\x02"])
-def test_packets_that_are_none_do_no_harm(controller, data):
+def test_invalid_packets_do_no_harm(controller, data):
     with socket.create_connection((controller.address, 30004)) as connection:
         connection.sendall(data)
     before = controller.robot.n_cycles
