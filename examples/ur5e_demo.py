@@ -1,7 +1,7 @@
 """A UR5e's whole story without one: a simulated arm is recorded, a policy trained, rolled out, an episode replayed.
 
 The commands are those for a real arm (docs/real_robot.md), each printed so that it can be repeated while
-`lerobot-uca-ur5e-sim` runs. What is complete is reused; remove outputs/ur5e_demo to start over.
+`lerobot-uca-ur5e-sim` runs. Complete results are reused; remove outputs/ur5e_demo to start over.
 """
 
 import argparse

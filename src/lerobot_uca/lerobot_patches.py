@@ -140,7 +140,7 @@ def shorten_decoder_warning() -> None:
         target.addFilter(_DecoderWarning())
 
 
-# What a checkpoint may do ---------------------------------------------------------------------------------------------
+# Limits of a checkpoint -----------------------------------------------------------------------------------------------
 
 _of_point_cloud_policy: ContextVar[bool] = ContextVar("of_point_cloud_policy", default=False)
 

@@ -1,6 +1,6 @@
 """A resumed training repeats the unbroken one bit for bit.
 
-Of LeRobot 0.6.1 it does not, for three reasons: accelerate's loader starts again at epoch 0, whatever epoch LeRobot has
+LeRobot 0.6.1's does not, for three reasons: accelerate's loader starts again at epoch 0, whatever epoch LeRobot has
 set in the sampler; making the loader's iterator draws from the generator after its state was loaded; and an
 evaluation draws from it between a checkpoint and the next step, which a resumed run leaves out.
 """

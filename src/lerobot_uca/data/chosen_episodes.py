@@ -44,7 +44,7 @@ def chosen_statistics(dataset: Any, masks: Masks) -> Statistics:
 def check_finite(dataset: Any, masks: Masks) -> None:
     """Raise a `UserError` that names episode and frame if a value of the chosen episodes is NaN or infinite.
 
-    Of a dataset that is not read in batches only the statistics are looked at, which name the episode alone.
+    If the dataset is not read in batches, only the statistics are checked; they name the episode alone.
     """
     columns = _columns(dataset)
     if columns is None:

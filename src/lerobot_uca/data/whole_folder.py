@@ -22,8 +22,8 @@ def whole_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
         with whole_folder(Path("data/door")) as unfinished:
             write_everything_into(unfinished)
 
-    What is yielded does not exist yet; it lies in a hidden folder beside `folder` and is moved there when the block
-    ends. If the block raises, it is removed. What a killed run could not remove, the next one removes.
+    The yielded path does not exist yet; it lies in a hidden folder beside `folder` and is moved there when the block
+    ends. If the block raises, it is removed. The next run removes the remains of a killed one.
 
     Args:
         folder: to write. Its parents are made if need be.

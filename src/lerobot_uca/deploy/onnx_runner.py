@@ -52,8 +52,8 @@ class OnnxPolicy:
     def select_action(self, point_cloud: np.ndarray, state: np.ndarray) -> np.ndarray:
         """The next action (A,), from the newest point cloud and state (S,). Call it once every step.
 
-        The cloud is (N, 3). Of one with more channels the first three are taken as xyz; one with more points is sampled
-        farthest point by farthest point, as the policy does.
+        The cloud is (N, 3). The first three of more channels are taken as xyz. More points are sampled farthest point
+        by farthest point, as the policy does.
         """
         cloud = _sampled(point_cloud, self._cloud_shape[0])
         frame = (_checked("point_cloud", cloud, self._cloud_shape), _checked("state", state, self._state_shape))

@@ -119,7 +119,7 @@ class PointCloudEnvConfig(EnvConfig):
 
     @override
     def get_env_processors(self) -> tuple[Any, Any]:
-        """Empty processors. Training asks for them before its first step: a wrong task is not found hours later."""
+        """Empty processors. Training asks for them before its first step, so that a wrong task is refused at once."""
         self.validate()
         return super().get_env_processors()
 

@@ -27,7 +27,7 @@ OPSET = 17  # the first with LayerNormalization
 WEIGHTS_PER_THREAD = 900_000
 """A second thread pays from about twice so many weights, those of all samples of a batch counted together."""
 MAX_TRACES = 4
-"""A function keeps traces of the shapes used last: each one holds 10 to 20 MB and threads of its own."""
+"""Traces of a function, for the shapes used last: each one holds 10 to 20 MB and threads of its own."""
 
 _exporter = threading.Lock()
 """PyTorch's exporter keeps its state in globals."""

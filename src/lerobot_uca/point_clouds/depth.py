@@ -146,7 +146,7 @@ class _Selector:
     def _limits_in(self, unit: float) -> tuple[Points, Points]:
         """The lowest and highest depth of each pixel that counts, in units: strictly between near and far.
 
-        They are in the image's own units, because 10 mm must be 0.01 m exactly. A pixel that misses the crop has none.
+        They are in the image's own units, because 10 mm must be 0.01 m exactly. A pixel outside the crop gets none.
         """
         near, far = np.float32(self.view.near / unit), np.float32(self.view.far / unit)
         lowest = np.maximum((self._enter / unit).astype(np.float32), np.nextafter(near, far))

@@ -163,7 +163,7 @@ MAX_PLAIN_POINTS = 1024
 def subsample_farthest(points: NDArray[np.float32], n_points: int) -> NDArray[np.float32]:
     """Farthest point sampling of a cloud (N, 3) with N of at least n_points, exact: (n_points, 3).
 
-    Of up to 1024 points it starts from the first one, so that a cloud in sampling order gives its own first n_points.
+    It starts from the first of up to 1024 points, so that a cloud in sampling order gives its own first n_points.
     """
     if len(points) > MAX_PLAIN_POINTS:
         return sample_farthest(points, n_points)

@@ -41,7 +41,7 @@ def make_processors(
 ) -> Processors:
     """LeRobot's pipelines (rename, batch, device, normalise; and back), with a uniform point cloud before the batch.
 
-    Where there are depth images, the cloud is made from them.
+    The cloud is made from depth images if there are any.
 
     Raises:
         UserError: as `settled_statistics`.

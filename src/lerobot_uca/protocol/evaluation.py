@@ -1,8 +1,8 @@
 """Evaluation episodes of a policy, many at once: the results of `lerobot-eval` in a fraction of its time.
 
-Four things save time. No picture is made. Nothing is observed that the policy does not look at: with two observation
-steps and three actions a plan, a third of the clouds. Episodes share the policy's calls, and where one has ended the
-next begins, so that none waits for the longest. Environments are kept.
+Four things save time. No picture is made. Observations that the policy does not look at are left out: with two
+observation steps and three actions a plan, a third of the clouds. Episodes share the policy's calls, and where one has
+ended the next begins, so that none waits for the longest. Environments are kept.
 
 Each episode draws its noise from a generator of its own, seeded as the episode is: an episode depends on the policy
 and its seed, not on which others ran beside it (rounding apart: a matrix product may add in another order).

@@ -96,7 +96,7 @@ class Results:
         return mean_over_tasks(there)
 
     def difference(self, policy: str, other: str, tasks: Sequence[str]) -> tuple[Estimate, list[str]] | None:
-        """The difference of two policies' success in the same episodes, on the tasks both have, and those tasks.
+        """Success of policy minus other in the same episodes, on the tasks that both have, and those tasks.
 
         Paired by task, training seed and episode.
         """

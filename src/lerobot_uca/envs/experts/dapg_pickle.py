@@ -1,7 +1,7 @@
 """Reads the original pickles of DAPG's policies, without importing or running anything that they name.
 
-They are instances of mjrl's `MLP` with PyTorch 0.3 or later inside. What a pickle asks for is replaced by stand-ins
-of our own: PyTorch's tensors become NumPy arrays, everything else of mjrl, PyTorch and NumPy an inert record. A name
+They are instances of mjrl's `MLP` with PyTorch 0.3 or later inside. Stand-ins of our own replace what a pickle asks
+for: PyTorch's tensors become NumPy arrays, everything else of mjrl, PyTorch and NumPy an inert record. A name
 from elsewhere is refused, and so is a key that is itself made of values: hashing one takes as long as its author likes.
 """
 

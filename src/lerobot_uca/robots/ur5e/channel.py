@@ -27,7 +27,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Target:
-    """A message to the arm: the target, and the time to it at the least."""
+    """A message to the arm: where to go, and the least time for it."""
 
     q: tuple[float, ...]  # (6,) [rad]
     duration: float  # [s]
@@ -53,7 +53,7 @@ class State:
 
 @dataclass(frozen=True)
 class Note:
-    """A message from the arm to tell the user."""
+    """A message from the arm for the user."""
 
     text: str
 

@@ -10,7 +10,7 @@ from lerobot_uca.errors import UserError
 DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT = 29999, 30004, 30003
 TIMEOUT = 3.0  # [s]
 TESTED_FIRMWARE = ("5.12",)
-"""PolyScope's releases, tried with the simulated controller. The authors have tried none on a real arm."""
+"""PolyScope's releases tried with the simulated controller. The authors have tried no release on a real arm."""
 
 logger = logging.getLogger(__name__)
 

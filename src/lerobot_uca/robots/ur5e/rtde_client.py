@@ -1,6 +1,6 @@
 """The process that talks to the arm. `RtdeProcess` starts it; it ends with the driver's process, whatever ends that.
 
-ur_rtde runs here and nowhere else. Of its release 1.6.5 this was measured: it dies of a segmentation fault when
+ur_rtde runs only here. Its release 1.6.5 was measured to fail in these ways: it dies of a segmentation fault when
 RTDE's stream breaks while the controller still accepts connections; `servoJ` answers True while the arm is stopped or
 gone and takes targets that are not numbers or too few; its getters repeat the last values for ever. So this loop checks
 connection, age of the data, program and safety before every command, sends checked targets only, and leaves at once,

@@ -109,7 +109,7 @@ class ScriptedTeleoperator(Teleoperator):
         return path
 
     def _begin_demonstration(self) -> None:
-        # Not prepared: the reset was too short for the way home.
+        # The path is not prepared if the reset was too short for the way home.
         self._path = self._prepare() if self._prepared is None else self._prepared
         self._is_demonstrating, self._prepared = True, None
 

@@ -169,7 +169,7 @@ class ScriptUpload:
         self._robot = robot
 
     def serve(self, connection: socket.socket) -> None:
-        """One client. Nothing is ever sent."""
+        """One client. It is never sent anything."""
         for line in connection.makefile("rb"):
             if line.rstrip(b"\r\n") == b"end":  # inner ones are indented
                 with self._robot.lock:
