@@ -75,7 +75,7 @@ def test_a_cloud_without_valid_points():
 
 def test_a_scan_is_sampled_all_over_and_not_in_its_first_corner():
     line = torch.stack([torch.linspace(0, 1, 401), torch.zeros(401), torch.zeros(401)], dim=-1)
-    sampled = PointCloudProcessorStep(n_points=5)._sampled(line[None, None])
+    sampled = PointCloudProcessorStep(n_points=5).uniform(line[None, None])
     assert sampled.shape == (1, 1, 5, 3)
     torch.testing.assert_close(sampled[0, 0, :, 0].sort().values, torch.tensor([0, 0.25, 0.5, 0.75, 1]))
 
@@ -84,7 +84,7 @@ def test_a_scan_is_sampled_all_over_and_not_in_its_first_corner():
 def test_a_cloud_in_sampling_order_keeps_its_first_points(n_points):
     points = np.random.default_rng(0).normal(size=(700, 3)).astype(np.float32)
     cloud = torch.from_numpy(sample_farthest(points, 200)).repeat(2, 1, 1)
-    assert torch.equal(PointCloudProcessorStep(n_points)._sampled(cloud), cloud[:, :n_points])
+    assert torch.equal(PointCloudProcessorStep(n_points).uniform(cloud), cloud[:, :n_points])
 
 
 @pytest.mark.parametrize(

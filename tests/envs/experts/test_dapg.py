@@ -273,7 +273,7 @@ def test_values_that_take_for_ever_are_refused(content, inside, tmp_path):
         content = b"\x80\x02ctorch.storage\n_load_from_bytes\nc_codecs\nencode\n" + text(encoded)
         content += text("latin1") + b"\x86R\x85R."
     (tmp_path / "door.pickle").write_bytes(content)
-    with pytest.raises(UserError, match="holds no DAPG policy"):
+    with pytest.raises(UserError, match="does not contain a DAPG policy"):
         DAPGWeights.read(tmp_path / "door.pickle")
 
 
