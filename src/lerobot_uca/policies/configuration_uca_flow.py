@@ -32,7 +32,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # Interval tokens N_h; likewise.
     n_interval_tokens: int = within(4, least=1, most=1024)
 
-    # How conditions reach actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
+    # Path from conditions to actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
     # same size).
     conditioning: str = "unified"
     # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
