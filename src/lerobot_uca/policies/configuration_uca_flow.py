@@ -40,7 +40,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
 
     # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
     dual_pass: bool = True
-    # The exponent of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with 0.5 and 0.001 it is MP1's.
+    # The gamma of the adaptive weight 1 / (||error||^2 + c)^(1 - gamma); with 0.5 and 0.001 it is MP1's.
     gamma: float = within(0.5, least=0, most=1)
     # See gamma.
     c: float = within(1e-3, above=0)
