@@ -1,6 +1,8 @@
 """Shared fixtures: everything tiny, real where it can be. The functions that make things are in builders.py."""
 
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if not ADROIT_EXPERTS.is_dir():
         line = f"NOT TESTED: Adroit's demonstrations, because there are no expert weights in {ADROIT_EXPERTS}"
         terminalreporter.write_line(line, red=True, bold=True)
+
+
+@pytest.fixture(autouse=True)
+def _no_accelerator() -> Iterator[None]:
+    """Accelerate keeps the first training's settings for the whole process, and refuses others."""
+    yield
+    if "accelerate.state" in sys.modules:
+        sys.modules["accelerate.state"].AcceleratorState._reset_state(reset_partial_state=True)
 
 
 @pytest.fixture(autouse=True)

@@ -25,6 +25,8 @@ NOT_RUN = {
     "python3.12 -m venv": "installs",
     "pip install": "installs",
     "accelerate launch": "tests/policies/test_distributed.py runs it, in two processes",
+    "lerobot-train --policy.path=": "needs data under another name; tests/test_normalisation.py trains on some",
+    "lerobot-uca-edit-dataset": "needs several episodes; tests/data/test_edit_dataset.py edits a dataset of three",
     "lerobot-uca-benchmark run": "trains 37 tasks; tests/protocol/test_run.py runs a tiny one",
     "lerobot-uca-benchmark report": "needs that run's folder; tests/protocol/test_report.py makes one",
     "lerobot-uca-benchmark demonstrators": "runs 1850 episodes; tests/protocol/test_demonstrators.py runs two",

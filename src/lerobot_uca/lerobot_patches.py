@@ -105,6 +105,7 @@ def report_user_errors() -> None:
     if getattr(previous, "_reports_user_errors", False):
         return
 
+    @functools.wraps(previous)  # with what it says of itself
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, UserError):

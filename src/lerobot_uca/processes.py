@@ -1,5 +1,6 @@
 """The end of processes: of a command by a signal, of a worker when its parent has ended."""
 
+import functools
 import multiprocessing
 import os
 import signal
@@ -39,6 +40,7 @@ def _report_interruption() -> None:
     if getattr(previous, "_reports_interruption", False):
         return
 
+    @functools.wraps(previous)  # with what it says of itself
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
         if _received:
             raise SystemExit(128 + _received[0])
