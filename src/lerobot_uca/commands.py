@@ -5,14 +5,19 @@ import sys
 from lerobot_uca.processes import end_by_signals
 
 
-def collect() -> None:
-    """`lerobot-uca-collect`."""
+def _begin() -> None:
+    """Let signals end the command cleanly, and LeRobot load its plugins: this one reports user errors in one line."""
     end_by_signals()
     from lerobot.utils.import_utils import register_third_party_plugins
 
+    register_third_party_plugins()
+
+
+def collect() -> None:
+    """`lerobot-uca-collect`."""
+    _begin()
     from lerobot_uca.data.collect import run
 
-    register_third_party_plugins()
     # LeRobot's parser wants a value for every option; a bare flag is what people type.
     bare = {"--overwrite", "--push_to_hub", "--private"}
     followed_by_value = [*(not argument.startswith("-") for argument in sys.argv[2:]), False]
@@ -25,34 +30,25 @@ def collect() -> None:
 
 def convert() -> None:
     """`lerobot-uca-convert`."""
-    end_by_signals()
-    from lerobot.utils.import_utils import register_third_party_plugins
-
+    _begin()
     from lerobot_uca.data.convert import run
 
-    register_third_party_plugins()
     run()
 
 
 def export() -> None:
     """`lerobot-uca-export`."""
-    end_by_signals()
-    from lerobot.utils.import_utils import register_third_party_plugins
-
+    _begin()
     from lerobot_uca.deploy.export import run
 
-    register_third_party_plugins()
     run()
 
 
 def calibrate() -> None:
     """`lerobot-uca-calibrate`."""
-    end_by_signals()
-    from lerobot.utils.import_utils import register_third_party_plugins
-
+    _begin()
     from lerobot_uca.robots.calibrate import run
 
-    register_third_party_plugins()
     run()
 
 
@@ -64,13 +60,31 @@ def edit_dataset() -> None:
     run()
 
 
+def saliency() -> None:
+    """`lerobot-uca-saliency`."""
+    _begin()
+    from lerobot_uca.visual.saliency import main
+
+    main()
+
+
+def view() -> None:
+    """`lerobot-uca-view`."""
+    _begin()
+    from lerobot_uca.visual.view import run
+
+    run()
+
+
+# These two need no LeRobot, which takes seconds to import. ------------------------------------------------------------
+
+
 def benchmark() -> None:
     """`lerobot-uca-benchmark`."""
+    end_by_signals()
     from lerobot_uca.errors import UserError
-    from lerobot_uca.processes import end_by_signals
     from lerobot_uca.protocol.command import main
 
-    end_by_signals()
     try:
         main()
     except UserError as error:
@@ -86,28 +100,3 @@ def ur5e_sim() -> None:
         main()
     except UserError as error:
         sys.exit(f"error: {error}")
-
-
-def saliency() -> None:
-    """`lerobot-uca-saliency`."""
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    from lerobot_uca.errors import UserError
-    from lerobot_uca.visual.saliency import main
-
-    register_third_party_plugins()
-    try:
-        main()
-    except UserError as error:
-        sys.exit(f"error: {error}")
-
-
-def view() -> None:
-    """`lerobot-uca-view`."""
-    end_by_signals()
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    from lerobot_uca.visual.view import run
-
-    register_third_party_plugins()
-    run()
