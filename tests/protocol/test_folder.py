@@ -3,6 +3,7 @@ import sys
 
 import pytest
 
+from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import RunFolder
@@ -41,6 +42,13 @@ def test_a_folder_of_another_setting(tmp_path, changes, difference):
     with pytest.raises(UserError) as caught:
         RunFolder.create(tmp_path, make_setting(**changes))
     assert f"was made with another setting: {difference}. Choose another --output" in str(caught.value)
+
+
+def test_demonstrations_are_written_while_their_folder_is_held(tmp_path):
+    folder = RunFolder.create(tmp_path, make_setting())
+    with folder.demonstrations(CELL) as dataset, whole_folder(dataset) as unfinished:
+        unfinished.mkdir()
+    assert dataset.is_dir()
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):

@@ -106,7 +106,8 @@ class RunFolder:
         """The folder of a task's dataset, there or not yet, for one process at a time."""
         folder = self.path / "demonstrations" / cell.task
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(folder.with_name(f".{folder.name}.lock"), fcntl.LOCK_EX):
+        # Not named .NAME.lock: lerobot-uca-collect, which writes the folder meanwhile, locks that one.
+        with _locked(folder.with_name(f".{folder.name}.claim"), fcntl.LOCK_EX):
             yield folder
 
     def log(self, message: str) -> None:
