@@ -12,6 +12,7 @@ from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud
 from lerobot_uca.inference.backends import BACKENDS
+from lerobot_uca.policies.augmentation_config import AugmentationConfig
 from lerobot_uca.policies.depth_config import DepthConfig
 from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
@@ -49,6 +50,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
 
     # Training from depth images, which become clouds.
     depth: DepthConfig = field(default_factory=DepthConfig)
+
+    # Changes to training's clouds that make the policy robust to a real camera.
+    augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
 
     # LeRobot takes the point cloud for a state: it is normalised by channel.
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -92,6 +96,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     def validate_sizes(self) -> None:
         """Raise a `UserError` for values outside their bounds or that do not fit together."""
         check_bounds(self, "policy")
+        check_bounds(self.augmentation, "policy.augmentation")
         if self.horizon < self.executed.stop:
             raise UserError(
                 f"policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = "

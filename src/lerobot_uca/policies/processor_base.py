@@ -26,6 +26,7 @@ from torch import Tensor
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud, valid_mask
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.processor_augmentation import CloudAugmentationProcessorStep, augmentation_steps
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
 from lerobot_uca.policies.statistics import check_statistics, settled_statistics
 
@@ -53,6 +54,7 @@ def make_processors(
             steps.rename_observations,
             DepthToCloudProcessorStep(recipe=config.depth.recipe),
             PointCloudProcessorStep(n_points=config.n_points),
+            *augmentation_steps(config),
             steps.add_batch_dim,
             steps.to_device,
             steps.normalize,
@@ -95,7 +97,10 @@ def load_processors(
 def _check_pipelines(
     config: PointCloudPolicyConfig, checkpoint: str, pre: PolicyProcessorPipeline, post: PolicyProcessorPipeline
 ) -> None:
-    """Check that all data reaches the policy and the robot normalised. Old checkpoints get the point-cloud step."""
+    """Check that all data reaches the policy and the robot normalised, and put the configuration's own steps in.
+
+    Old checkpoints lack the point-cloud step, and a training that starts from a checkpoint may augment otherwise.
+    """
     for pipeline, kind, keys in (
         (pre, NormalizerProcessorStep, (OBS_POINT_CLOUD, OBS_STATE, ACTION)),
         (post, UnnormalizerProcessorStep, (ACTION,)),
@@ -109,13 +114,15 @@ def _check_pipelines(
             stats = {name.rpartition("."): value for name, value in step.state_dict().items()}
             stats = {name: value for (of, _, name), value in stats.items() if of == key}
             check_statistics(key, stats, config, where=f"the {kind._registry_name}'s in '{checkpoint}'")
-    clouds = [each for each in pre.steps if isinstance(each, PointCloudProcessorStep)]
-    if clouds:
-        clouds[0].n_points = config.n_points
-    else:
-        renames = [isinstance(each, RenameObservationsProcessorStep) for each in pre.steps]
-        pre.steps = [*pre.steps]
-        pre.steps.insert(renames.index(True) + 1 if True in renames else 0, PointCloudProcessorStep(config.n_points))
+    steps = [each for each in pre.steps if not isinstance(each, CloudAugmentationProcessorStep)]
+    kinds = [type(each) for each in steps]
+    if PointCloudProcessorStep not in kinds:
+        before = RenameObservationsProcessorStep
+        kinds.insert(kinds.index(before) + 1 if before in kinds else 0, PointCloudProcessorStep)
+        steps.insert(kinds.index(PointCloudProcessorStep), PointCloudProcessorStep())
+    place = kinds.index(PointCloudProcessorStep)
+    steps[place].n_points = config.n_points
+    pre.steps = [*steps[: place + 1], *augmentation_steps(config), *steps[place + 1 :]]
 
 
 @dataclass
