@@ -21,7 +21,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.processor_base import PointCloudProcessorStep
-from tests.builders import N_ACTIONS, N_POINTS, N_STATES, SMALL_POLICIES, write_dataset
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, SMALL_POLICIES, make_observation, write_dataset
 
 STATE, ACTION = "observation.state", "action"
 STATISTICS = "policy_preprocessor_step_5_normalizer_processor.safetensors"
@@ -161,6 +161,37 @@ def test_clouds_of_other_plugins_train_and_act(tmp_path, cloud, channels):
     frame = LeRobotDataset("test/random", root=tmp_path / "data")[0]
     assert post(policy.select_action(pre(frame))).shape == (1, N_ACTIONS)
     assert RawPolicy(str(trained)).input_shapes["point_cloud"] == (2, N_POINTS, 3)
+
+
+@pytest.mark.parametrize("n_points", [None, 16])
+def test_colours_train_act_and_are_normalised_by_channel(tmp_path, n_points):
+    def bright(frame, *_):
+        frame["observation.pointcloud"][:, 3:] = np.random.default_rng(1).uniform(0, 255, (N_POINTS, 3))
+
+    write_dataset(tmp_path / "data", features=features("observation.pointcloud", channels=6), change=bright)
+    trained = train(tmp_path / "data", tmp_path / "new", policy={"colour": True, "n_points": n_points})
+    everything = columns(tmp_path / "data", "observation.pointcloud")
+    if n_points is None:
+        np.testing.assert_allclose(saved(trained)[f"{OBS_POINT_CLOUD}.max"], everything.max(axis=(0, 1)), rtol=1e-6)
+    policy, pre, post = load(trained)
+    frame = LeRobotDataset("test/random", root=tmp_path / "data")[0]
+    batch = pre(frame)
+    assert batch[OBS_POINT_CLOUD].shape == (1, n_points or N_POINTS, 6)
+    assert batch[OBS_POINT_CLOUD].abs().max() <= 1 + 1e-5
+    assert post(policy.select_action(batch)).shape == (1, N_ACTIONS)
+    assert RawPolicy(str(trained)).input_shapes["point_cloud"] == (2, n_points or N_POINTS, 6)
+    further = train(tmp_path / "data", tmp_path / "further", checkpoint=trained)
+    assert load(further)[0].config.input_features[OBS_POINT_CLOUD].shape == (N_POINTS, 6)
+
+
+def test_colours_that_are_missing(dataset_root, checkpoint, tmp_path):
+    with pytest.raises(UserError, match=r"must have shape \(N, 6\) with .* after xyz and RGB .*, got \(32, 3\)"):
+        train(dataset_root, tmp_path / "new", policy={"colour": True})
+    _, pre, _ = load(checkpoint)
+    step = next(each for each in pre.steps if isinstance(each, PointCloudProcessorStep))
+    step.colour = True
+    with pytest.raises(UserError, match=r"must have shape \(..., N, 6\) or more channels, got \(1, 32, 3\)"):
+        pre(make_observation())
 
 
 def test_invalid_points_count_nowhere(tmp_path):

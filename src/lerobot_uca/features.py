@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 OBS_POINT_CLOUD = "observation.point_cloud"
-"""(N, 3) float32 [m], in the frame that the environment or robot states."""
+"""(N, 3) float32 [m], in the frame that the environment or robot states; with colours (N, 6), RGB after xyz."""
 
 ENV_NAMES = {"point_cloud": OBS_POINT_CLOUD, "agent_pos": "observation.state"}
 """The environments' names of their observations, and the policies'."""

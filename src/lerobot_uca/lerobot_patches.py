@@ -360,17 +360,16 @@ def _normalise_by_chosen_episodes(policy: PointCloudPolicyConfig, dataset: Any, 
     check_finite(dataset, masks)
     cloud_name = find_point_cloud(renamed)
     if policy.n_points is not None and cloud_name is not None and isinstance(dataset, BatchedDataset):
-        _sample_clouds(policy.n_points, dataset, key_of[cloud_name])
+        _sample_clouds(PointCloudProcessorStep(policy.n_points, policy.colour), dataset, key_of[cloud_name])
     if dataset.meta.stats:
         dataset.meta.stats = {**dataset.meta.stats, **chosen_statistics(dataset, masks)}
 
 
-def _sample_clouds(n_points: int, dataset: BatchedDataset, key: str) -> None:
+def _sample_clouds(step: PointCloudProcessorStep, dataset: BatchedDataset, key: str) -> None:
     """Sample all clouds once: the processor's step would sample them again in every epoch."""
-    columns = dataset.columns()
-    if columns is None or columns.tensors[key].shape[1] <= n_points:
+    columns, n_points = dataset.columns(), step.n_points
+    if columns is None or n_points is None or columns.tensors[key].shape[1] <= n_points:
         return
-    step = PointCloudProcessorStep(n_points)
     mask = columns.tensors.pop(valid_mask(key, columns.tensors) or "", None)
     clouds = columns.tensors[key]
     rows = tqdm(range(len(clouds)), desc=f"Sampling {n_points} of {clouds.shape[1]} points", unit="cloud")

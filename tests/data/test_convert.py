@@ -125,6 +125,44 @@ def test_dp3s_zarr(tmp_path, caplog):
     assert "Not kept: data/img, colours of data/point_cloud." in caplog.messages
 
 
+def test_colours_are_kept_when_asked_for(tmp_path, caplog):
+    arrays = write_zarr(tmp_path / "drawer.zarr")
+    dataset = convert(config(tmp_path / "drawer.zarr", tmp_path / "clouds", fps=10, colour=True))
+    assert dataset.features[OBS_POINT_CLOUD]["shape"] == (N_CLOUD_POINTS, 6)
+    assert dataset.features[OBS_POINT_CLOUD]["names"] == ["point", "xyzrgb"]
+    for index in (0, 11):
+        cloud, source = dataset[index][OBS_POINT_CLOUD].numpy(), arrays["data/point_cloud"][index].astype(np.float32)
+        assert set(map(tuple, cloud)) <= set(map(tuple, source))
+    assert "Not kept: data/img." in caplog.messages
+    write_zarr(tmp_path / "grey.zarr", channels=3)
+    with pytest.raises(UserError, match=r"--colour=true needs points with RGB after xyz, \(N, 6\), got \(600, 3\) in"):
+        convert(config(tmp_path / "grey.zarr", tmp_path / "grey", fps=10, colour=True))
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_depth_has_no_colours(depth_dataset, tmp_path):
+    with pytest.raises(UserError, match="depth images have none"):
+        convert(config(depth_dataset.root, tmp_path / "clouds", colour=True))
+
+
+def test_colours_beside_the_points(tmp_path, caplog):
+    """observation.pointcloud.xyz and .rgb, as datasets on the Hub have them."""
+    features = {
+        "observation.pointcloud.xyz": {"dtype": "float32", "shape": (90, 3), "names": None},
+        "observation.pointcloud.rgb": {"dtype": "uint8", "shape": (90, 3), "names": None},
+        "observation.state": {"dtype": "float32", "shape": (7,), "names": None},
+        "action": {"dtype": "float32", "shape": (7,), "names": None},
+    }
+    source = write_dataset(tmp_path / "source", n_episodes=1, length=4, features=features)
+    wide = {"crop_low": (-5, -5, -5), "crop_high": (5, 5, 5)}
+    dataset = convert(config(source.root, tmp_path / "clouds", colour=True, **wide))
+    theirs = np.concatenate([source[2][f"observation.pointcloud.{part}"].numpy() for part in ("xyz", "rgb")], axis=1)
+    assert set(map(tuple, dataset[2][OBS_POINT_CLOUD].numpy())) <= set(map(tuple, theirs))
+    assert not [message for message in caplog.messages if message.startswith("Not kept")]
+    convert(config(source.root, tmp_path / "plain", **wide))
+    assert "Not kept: observation.pointcloud.rgb." in caplog.messages
+
+
 def test_without_a_crop_all_points_count(tmp_path):
     write_zarr(tmp_path / "a.zarr", channels=3)
     dataset = convert(config(tmp_path / "a.zarr", tmp_path / "clouds", fps=10, crop_low=None, crop_high=None))
@@ -162,7 +200,8 @@ def write_folder(folder, kind, *, n_frames=4):
         if kind == "npz":
             np.savez(folder / name, points=points)
         else:
-            vertices = np.array([tuple(p) for p in points], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+            channels = [*((axis, "f4") for axis in "xyz"), *((name, "u1") for name in ("red", "green", "blue"))]
+            vertices = np.array([(*p, 10, 20, 30) for p in points.tolist()], dtype=channels)
             plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(str(folder / name))
         rows.append(
             [name, index // 2, f"task {index // 2}", *rng.normal(size=3).round(3), *rng.normal(size=2).round(3)]
@@ -187,6 +226,13 @@ def test_a_folder_of_files(tmp_path, kind):
         np.testing.assert_allclose(frame["action"], row[6:], atol=1e-6)
         assert frame["task"] == row[2]
         assert set(map(tuple, frame[OBS_POINT_CLOUD].numpy())) <= set(map(tuple, cloud))
+
+
+def test_colours_of_ply_files(tmp_path):
+    write_folder(tmp_path / "recorded", "ply")
+    dataset = convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, colour=True))
+    cloud = dataset[0][OBS_POINT_CLOUD].numpy()
+    np.testing.assert_array_equal(cloud[:, 3:], np.broadcast_to([10, 20, 30], (N_CLOUD_POINTS, 3)))
 
 
 # The report ---------------------------------------------------------------------------------------------------------

@@ -11,14 +11,16 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy_config, make_pre_post_processors
-from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config, make_settings
 
 from lerobot_uca.deploy import onnx_runner
 from lerobot_uca.deploy.export import export
 from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.policies.augmentation_config import AugmentationConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 
@@ -28,14 +30,20 @@ def save(folder: Path, **changes: object) -> UCAFlowPolicy:
     with torch.no_grad():
         for parameter in policy.ema_model.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
+    n_channels = policy.config.n_channels
     stats = {
         key: {"min": -torch.rand(size), "max": 1 + torch.rand(size), "mean": torch.rand(size), "std": torch.rand(size)}
-        for key, size in ((OBS_POINT_CLOUD, 3), ("observation.state", N_STATES), ("action", N_ACTIONS))
+        for key, size in ((OBS_POINT_CLOUD, n_channels), ("observation.state", N_STATES), ("action", N_ACTIONS))
     }
     policy.save_pretrained(folder)
     for processor in make_pre_post_processors(policy.config, dataset_stats=stats):
         processor.save_pretrained(folder)
     return policy
+
+
+def coloured_features() -> dict:
+    cloud = PolicyFeature(FeatureType.STATE, (N_POINTS, 6))
+    return {**make_settings()["input_features"], OBS_POINT_CLOUD: cloud}
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +79,9 @@ def actions_of_lerobots_loop(policy: UCAFlowPolicy, folder: Path, observations: 
         {"obs_stride": 2, "horizon": 16},
         {"n_obs_steps": 3, "obs_stride": 3, "horizon": 8, "n_action_steps": 2},
         {"normalization_mapping": {"STATE": "MEAN_STD", "ACTION": "IDENTITY"}},
+        {"augmentation": AugmentationConfig(jitter=0.1)},
+        {"colour": True, "input_features": coloured_features()},
+        {"colour": True, "input_features": coloured_features(), "n_points": 10},
     ],
 )
 def test_the_runner_acts_as_the_policy_in_lerobots_loop(tmp_path, changes, monkeypatch):
@@ -79,7 +90,10 @@ def test_the_runner_acts_as_the_policy_in_lerobots_loop(tmp_path, changes, monke
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(policy.config.horizon, N_ACTIONS)).astype(np.float32)
     observations = [
-        (rng.uniform(-1, 2, (N_POINTS, 3)).astype(np.float32), rng.uniform(-1, 2, N_STATES).astype(np.float32))
+        (
+            rng.uniform(-1, 2, (N_POINTS, policy.config.n_channels)).astype(np.float32),
+            rng.uniform(-1, 2, N_STATES).astype(np.float32),
+        )
         for _ in range(7)
     ]
     runner = OnnxPolicy(tmp_path / "policy.onnx")

@@ -9,6 +9,7 @@ from lerobot_uca.point_clouds.geometry import (
     opengl_from_opencv,
     ray_sphere_distances,
     sample_farthest,
+    subsample_farthest,
 )
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -122,6 +123,17 @@ def test_too_few_points_are_repeated_in_turn():
     np.testing.assert_array_equal(sample[:5], sample[5:10])
     assert len(np.unique(sample, axis=0)) == 5
     assert (sample > 1).all()  # no zeros
+
+
+@pytest.mark.parametrize("sample", [sample_farthest, subsample_farthest])
+def test_colours_come_along_and_do_not_count_as_distances(sample):
+    rng = np.random.default_rng(0)
+    points, colours = rng.normal(size=(500, 3)), rng.uniform(0, 255, (500, 3))
+    coloured = sample(np.concatenate([points, colours], axis=1).astype(np.float32), 40)
+    np.testing.assert_array_equal(coloured[:, :3], sample(points.astype(np.float32), 40))
+    row = {tuple(point): colour for point, colour in zip(points.astype(np.float32).tolist(), colours, strict=True)}
+    for each in coloured.tolist():
+        np.testing.assert_allclose(each[3:], row[tuple(each[:3])], rtol=1e-6)
 
 
 def test_an_empty_cloud_is_an_error():

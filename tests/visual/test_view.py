@@ -36,6 +36,14 @@ def test_depth_is_seen_inside_and_outside_the_crop(depth_dataset):
     assert (colours == command.INSIDE).all(axis=1).sum() == len(inside)
 
 
+def test_colours_are_the_points_own_where_they_have_some():
+    points = np.array([[0.5, 0, 0.1, 1.0, 0.5, 0], [5, 5, 5, 1.0, 0.5, 0]], dtype=np.float32)
+    np.testing.assert_array_equal(colours_of(points, CROP), [(255, 127, 0), command.OUTSIDE])
+    points[0, 3:] = (200, 100, 0)
+    np.testing.assert_array_equal(colours_of(points, CROP)[0], (200, 100, 0))
+    np.testing.assert_array_equal(colours_of(points[:, :3], CROP), [command.INSIDE, command.OUTSIDE])
+
+
 def test_an_environment():
     (cloud,) = clouds_of(ViewConfig(env=MetaworldPointCloudConfig(task="reach", n_points=64), episode=3))
     assert cloud.shape == (64, 3)

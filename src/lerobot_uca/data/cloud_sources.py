@@ -27,7 +27,7 @@ ACTION, STATE = "action", "observation.state"
 class Frame(NamedTuple):
     """One step as it was recorded."""
 
-    points: NDArray[np.float32]  # (any number, 3) [m], inside the crop; of depth those that are sampled from
+    points: NDArray[np.float32]  # (any number, 3) [m], or 6 with RGB; inside the crop; of depth the sampled ones
     n_points: int  # inside the crop
     invalid: float  # share of pixels without depth, or of points that are not finite
     state: NDArray[np.float32]  # (S,)
@@ -40,6 +40,7 @@ class Source(ABC):
 
     path: Path
     crop: Crop | None
+    colour: bool
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what has been opened: another process opens it itself."""
@@ -73,11 +74,21 @@ class Source(ABC):
         return []
 
     def _cropped(self, points: NDArray[Any]) -> tuple[NDArray[np.float32], int, float]:
-        """The finite points inside the crop, of (N, 3 or more), their number, and the share that is not finite."""
-        xyz = np.asarray(points, dtype=np.float32)[:, :3]
-        finite = np.asarray(np.all(np.isfinite(xyz), axis=1))
-        inside = finite if self.crop is None else finite & self.crop.contains(np.where(finite[:, None], xyz, np.inf))
-        return xyz[inside], int(inside.sum()), 1 - float(finite.mean()) if len(finite) else 1.0
+        """The finite points inside the crop, of (N, 3 or more), their number, and the share that is not finite.
+
+        Raises:
+            UserError: if their colours are wanted and they have none.
+        """
+        n_channels = 6 if self.colour else 3
+        if points.shape[1] < n_channels:
+            raise UserError(
+                f"--colour=true needs points with RGB after xyz, (N, 6), got {points.shape} in '{self.path}'."
+            )
+        wanted = np.asarray(points, dtype=np.float32)[:, :n_channels]
+        finite = np.asarray(np.all(np.isfinite(wanted), axis=1))
+        xyz = np.where(finite[:, None], wanted[:, :3], np.inf)
+        inside = finite if self.crop is None else finite & self.crop.contains(xyz)
+        return wanted[inside], int(inside.sum()), 1 - float(finite.mean()) if len(finite) else 1.0
 
 
 @dataclass
@@ -87,11 +98,13 @@ class LeRobotSource(Source):
     Args:
         path: its folder.
         crop: for clouds; depth is cropped by its recipe.
+        colour: whether clouds keep their colours, RGB after xyz.
         depth_recipe: how clouds are made from depth; None takes the dataset's own clouds.
     """
 
     path: Path
     crop: Crop | None = None
+    colour: bool = False
     depth_recipe: CloudRecipe | None = None
 
     @cached_property
@@ -129,7 +142,7 @@ class LeRobotSource(Source):
 
     def left_out(self) -> list[str]:
         """Features that are neither cloud, depth, state nor action."""
-        kept = {STATE, ACTION, self._cloud_key, *(self.depth_recipe.keys if self.depth_recipe else ())}
+        kept = {STATE, ACTION, self._cloud_key, self._rgb_key, *(self.depth_recipe.keys if self.depth_recipe else ())}
         own = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
         return [key for key in self.features if key not in kept | own]
 
@@ -142,6 +155,12 @@ class LeRobotSource(Source):
     @cached_property
     def _cloud_key(self) -> str | None:
         return find_point_cloud(self.features)
+
+    @cached_property
+    def _rgb_key(self) -> str | None:
+        """The colours' feature, where they are not in the cloud's and are wanted."""
+        key = (self._cloud_key or "").removesuffix(".xyz") + ".rgb"
+        return key if self.colour and key in self.features else None
 
     @cached_property
     def _make(self) -> Any:
@@ -166,6 +185,8 @@ class LeRobotSource(Source):
         if self._cloud_key is None:
             raise UserError(f"'{self.path}' has neither depth nor a point cloud, got {', '.join(self.features)}.")
         cloud = item[self._cloud_key].numpy()
+        if self._rgb_key is not None:
+            cloud = np.concatenate([cloud, item[self._rgb_key].numpy()], axis=-1)
         mask = item.get(self._cloud_key.removesuffix(".xyz") + VALID_MASK_SUFFIX)
         return self._cropped(cloud if mask is None else cloud[mask.numpy().astype(bool)])
 
@@ -177,6 +198,7 @@ class ZarrSource(Source):
     path: Path
     crop: Crop | None = None
     task: str = ""
+    colour: bool = False
 
     @cached_property
     def _group(self) -> Any:
@@ -221,7 +243,8 @@ class ZarrSource(Source):
     def left_out(self) -> list[str]:
         """Arrays that are not kept, and colours."""
         kept = {key.partition("/")[2] for key in ZARR_KEYS[:3]}
-        colours = ["colours of data/point_cloud"] if self._group[ZARR_KEYS[0]].shape[2] > 3 else []
+        has_colours = self._group[ZARR_KEYS[0]].shape[2] > 3
+        colours = ["colours of data/point_cloud"] if has_colours and not self.colour else []
         return [f"data/{key}" for key in self._group["data"] if key not in kept] + colours
 
 
@@ -230,12 +253,14 @@ class FolderSource(Source):
     """PLY or NPZ files, and a frames.csv that lists them in their order.
 
     Its columns: file, episode, state_* and action_* (in the order of the vectors), and task if it is not given.
-    A PLY file holds vertices with x, y, z [m]; an NPZ file an array 'points' (N, 3 or more) [m].
+    A PLY file holds vertices with x, y, z [m] and perhaps red, green, blue; an NPZ file an array 'points' (N, 3) [m],
+    or (N, 6) with RGB after xyz.
     """
 
     path: Path
     crop: Crop | None = None
     task: str = ""
+    colour: bool = False
 
     @cached_property
     def _rows(self) -> list[dict[str, str]]:
@@ -304,7 +329,8 @@ def _read_ply(file: Path) -> NDArray[Any]:
         vertices = PlyData.read(str(file))["vertex"]
     except PlyParseError as error:
         raise ValueError(str(error)) from error
-    return np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    colours = [name for name in ("red", "green", "blue") if name in vertices]
+    return np.stack([vertices[name].astype(np.float32) for name in ("x", "y", "z", *colours)], axis=1)
 
 
 def _read_npz(file: Path) -> NDArray[Any]:
@@ -315,18 +341,18 @@ def _read_npz(file: Path) -> NDArray[Any]:
 READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".ply": _read_ply, ".npz": _read_npz}
 
 
-def find_source(path: Path, crop: Crop | None, task: str) -> Source:
+def find_source(path: Path, crop: Crop | None, task: str, *, colour: bool = False) -> Source:
     """The source of a path, by what lies in it.
 
     Raises:
         UserError: if its kind is unknown.
     """
     if (path / "meta" / "info.json").is_file():
-        return LeRobotSource(path, crop)
+        return LeRobotSource(path, crop, colour)
     if (path / ".zgroup").is_file() or (path / "zarr.json").is_file() or path.suffix == ".zarr":
-        return ZarrSource(path, crop, task)
+        return ZarrSource(path, crop, task, colour)
     if (path / "frames.csv").is_file():
-        return FolderSource(path, crop, task)
+        return FolderSource(path, crop, task, colour)
     raise UserError(
         f"'{path}' must be a LeRobot dataset (meta/info.json), a zarr of DP3's layout, or a folder with a frames.csv."
     )

@@ -60,6 +60,8 @@ class ConvertConfig:
     crop_high: tuple[float, float, float] | None = None
     # Points of each cloud.
     n_points: int = within(512, least=1, most=100_000)
+    # Keep the points' colours: clouds (N, 6), RGB after xyz, as they are. policy.colour=true looks at them.
+    colour: bool = False
     # Folder of the cameras' calibrations; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
     # The episodes to convert, such as [0,1,5]; by default all.
@@ -79,7 +81,7 @@ class ConvertConfig:
 class Episode(NamedTuple):
     """One converted episode of L steps."""
 
-    clouds: NDArray[np.float32]  # (L, N, 3)
+    clouds: NDArray[np.float32]  # (L, N, 3), or 6 with colours
     state: NDArray[np.float32]  # (L, S)
     action: NDArray[np.float32]  # (L, A)
     tasks: list[str]
@@ -116,9 +118,12 @@ def make_source(config: ConvertConfig) -> Source:
         raise UserError("Give both crop_low and crop_high, or neither.")
     corners = None if config.crop_low is None or config.crop_high is None else (config.crop_low, config.crop_high)
     try:
-        source = find_source(config.source, make_crop(*corners) if corners else None, config.task)
+        crop = make_crop(*corners) if corners else None
+        source = find_source(config.source, crop, config.task, colour=config.colour)
         if isinstance(source, LeRobotSource):
             features = source.features
+            if depth_keys(features) and config.colour:
+                raise UserError("--colour=true needs points with colours: depth images have none.")
             if depth_keys(features):
                 source.depth_recipe = recipe_for(features, corners, config.n_points, config.calibration)
     except CalibrationError as error:
@@ -135,8 +140,8 @@ def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
         episode,
         n_points=np.array([frame.n_points for frame in frames]),
         invalid=np.array([frame.invalid for frame in frames]),
-        low=np.min([cloud.min(axis=0) for cloud in clouds], axis=0),
-        high=np.max([cloud.max(axis=0) for cloud in clouds], axis=0),
+        low=np.min([cloud[:, :3].min(axis=0) for cloud in clouds], axis=0),
+        high=np.max([cloud[:, :3].max(axis=0) for cloud in clouds], axis=0),
         state=state,
         action=action,
     )
@@ -146,7 +151,7 @@ def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
 def _sample(points: NDArray[np.float32], n_points: int) -> NDArray[np.float32]:
     """Sample as `DepthToCloud` does. An empty cloud stays visible as NaN until the report is written."""
     if len(points) == 0:
-        return np.full((n_points, 3), np.nan, np.float32)
+        return np.full((n_points, points.shape[1]), np.nan, np.float32)
     return sample_farthest(points, n_points)
 
 
@@ -226,8 +231,8 @@ def _features(config: ConvertConfig, source: Source, episode: Episode) -> dict[s
     return {
         OBS_POINT_CLOUD: {
             "dtype": "float32",
-            "shape": (config.n_points, 3),
-            "names": ["point", "xyz"],
+            "shape": episode.clouds.shape[1:],
+            "names": ["point", "xyzrgb" if config.colour else "xyz"],
             "info": info,
         },
         **{

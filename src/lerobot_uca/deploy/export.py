@@ -26,9 +26,10 @@ from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
 # These steps do the same for all observations, so that a trace of them holds. A file takes clouds: the step that
-# makes them from depth images has nothing to do.
+# makes them from depth images has nothing to do, nor has the one that changes training's.
 TRACEABLE_STEPS = {
     *("rename_observations_processor", "depth_to_cloud_processor", "point_cloud_processor", "to_batch_processor"),
+    "cloud_augmentation_processor",
     *("device_processor", "normalizer_processor", "unnormalizer_processor"),
 }
 FILES = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")
@@ -78,7 +79,7 @@ class RawPolicy:
         n_steps = config.obs_span + 1
         n_points = config.n_points or config.input_features[OBS_POINT_CLOUD].shape[0]
         return {
-            "point_cloud": (n_steps, n_points, 3),
+            "point_cloud": (n_steps, n_points, config.n_channels),
             "state": (n_steps, config.n_states),
             "noise": (config.horizon, config.n_actions),
         }
@@ -87,8 +88,8 @@ class RawPolicy:
         """Actions (n_action_steps, A) from the latest steps and noise (T, A).
 
         Args:
-            point_cloud, state: (K, N, 3) and (K, S), oldest first; all K steps from the first observed one to the
-                current one, so that a runner needs to know nothing of the observation stride.
+            point_cloud, state: (K, N, 3), with colours (K, N, 6), and (K, S), oldest first; all K steps from the first
+                observed one to the current one, so that a runner needs to know nothing of the observation stride.
         """
         stride = policy.config.obs_stride
         batch = self._pre({OBS_POINT_CLOUD: point_cloud[None, ::stride], OBS_STATE: state[None, ::stride]})

@@ -52,10 +52,10 @@ class OnnxPolicy:
     def select_action(self, point_cloud: np.ndarray, state: np.ndarray) -> np.ndarray:
         """The next action (A,), from the newest point cloud and state (S,). Call it once every step.
 
-        The cloud is (N, 3). The first three of more channels are taken as xyz. More points are sampled farthest point
-        by farthest point, as the policy does.
+        The cloud is (N, 3), or (N, 6) if the policy sees colours. The first of more channels are taken. More points
+        are sampled farthest point by farthest point, as the policy does.
         """
-        cloud = _sampled(point_cloud, self._cloud_shape[0])
+        cloud = _sampled(point_cloud, *self._cloud_shape)
         frame = (_checked("point_cloud", cloud, self._cloud_shape), _checked("state", state, self._state_shape))
         self._history.extend([frame] * (1 if self._history else self._n_steps))
         if not self._action_queue:
@@ -67,7 +67,7 @@ class OnnxPolicy:
         """Actions (n_action_steps, A), to be executed from now on, from the latest steps, oldest first.
 
         Args:
-            point_clouds: (K, N, 3).
+            point_clouds: (K, N, 3) or (K, N, 6).
             states: (K, S).
             noise: (T, A), Gaussian; drawn if not given.
         """
@@ -105,17 +105,18 @@ def check_version(version: str) -> None:
         raise RuntimeError(f"onnxruntime must be at least {minimum}, got {version}.")
 
 
-def _sampled(point_cloud: np.ndarray, n_points: int) -> np.ndarray:
+def _sampled(point_cloud: np.ndarray, n_points: int, n_channels: int) -> np.ndarray:
     points = np.asarray(point_cloud, dtype=np.float32)
-    if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points).all():
+    if points.ndim != 2 or points.shape[1] < n_channels or not np.isfinite(points).all():
         return points  # refused by the check that follows
-    points = points[:, :3]
+    points = points[:, :n_channels]
     if len(points) <= n_points:
         return points
+    xyz = points[:, :3]
     order = np.zeros(n_points, dtype=np.int64)
     distances = np.full(len(points), np.inf, dtype=np.float32)
     for i in range(1, n_points):
-        distances = np.minimum(distances, np.square(points - points[order[i - 1]]).sum(axis=1))
+        distances = np.minimum(distances, np.square(xyz - xyz[order[i - 1]]).sum(axis=1))
         order[i] = distances.argmax()
     return points[order]
 

@@ -15,12 +15,14 @@ class PointEncoder(nn.Module):
     The order of the points does not matter. A point receives a gradient only through the features in which it has its
     cloud's largest value. So training finds these winners, 20 to 40 % of the points, without a graph, and computes only
     them once more to differentiate: the same gradients for less time.
+
+    Points have 3 channels, xyz, or 6 with RGB.
     """
 
-    def __init__(self, widths: tuple[int, ...], n_features: int) -> None:
+    def __init__(self, widths: tuple[int, ...], n_features: int, n_channels: int = 3) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        for n_in, n_out in zip((3, *widths[:-1]), widths, strict=True):
+        for n_in, n_out in zip((n_channels, *widths[:-1]), widths, strict=True):
             layers += [nn.Linear(n_in, n_out), nn.LayerNorm(n_out), nn.ReLU()]
         self.per_point = nn.Sequential(*layers[:-1])
         # The last ReLU comes after the maximum: the same result, on far fewer values.
@@ -61,10 +63,15 @@ class ObservationEncoder(nn.Module):
     """[point-cloud feature; state feature] for each observation step (paper section 3.2)."""
 
     def __init__(
-        self, n_states: int, point_widths: tuple[int, ...], n_point_features: int, n_state_features: int
+        self,
+        n_states: int,
+        point_widths: tuple[int, ...],
+        n_point_features: int,
+        n_state_features: int,
+        n_channels: int = 3,
     ) -> None:
         super().__init__()
-        self.points = PointEncoder(point_widths, n_point_features)
+        self.points = PointEncoder(point_widths, n_point_features, n_channels)
         self.state = nn.Sequential(
             nn.Linear(n_states, n_state_features), nn.ReLU(), nn.Linear(n_state_features, n_state_features)
         )

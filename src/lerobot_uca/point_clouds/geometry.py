@@ -161,7 +161,7 @@ MAX_PLAIN_POINTS = 1024
 
 
 def subsample_farthest(points: NDArray[np.float32], n_points: int) -> NDArray[np.float32]:
-    """Farthest point sampling of a cloud (N, 3) with N of at least n_points, exact: (n_points, 3).
+    """Farthest point sampling of a cloud (N, 3 or more) with N of at least n_points, exact: (n_points, 3 or more).
 
     It starts from the first of up to 1024 points, so that a cloud in sampling order gives its own first n_points.
     """
@@ -169,11 +169,13 @@ def subsample_farthest(points: NDArray[np.float32], n_points: int) -> NDArray[np
         return sample_farthest(points, n_points)
     import fpsample  # where a cloud is sampled: policies must register without it
 
-    return points[fpsample.fps_sampling(points, n_points, start_idx=0)]
+    return points[fpsample.fps_sampling(_xyz(points), n_points, start_idx=0)]
 
 
 def sample_farthest(points: NDArray[np.floating[Any]], n_points: int) -> NDArray[np.float32]:
-    """Farthest point sampling of points (N, 3), exact: (n_points, 3) float32 in sampling order.
+    """Farthest point sampling of points (N, 3 or more), exact: (n_points, 3 or more) float32 in sampling order.
+
+    Distances are those of xyz, the first three channels; further ones, such as colours, come along.
 
     Every prefix of the result is itself a farthest point sampling, so a policy may take the first 128 of 512.
     The k-d tree decides where it starts, so the same points always give the same sample. If there are fewer points
@@ -186,10 +188,15 @@ def sample_farthest(points: NDArray[np.floating[Any]], n_points: int) -> NDArray
         raise ValueError("The point cloud is empty: 0 points, at least 1 is needed.")
     import fpsample  # as above
 
-    cloud = np.ascontiguousarray(points, dtype=np.float32)
+    cloud = np.asarray(points, dtype=np.float32)
+    xyz = _xyz(cloud)
     n_distinct = min(n_points, len(cloud))
     if len(cloud) < 2**KD_TREE_HEIGHT:  # too few to fill the tree
-        order = fpsample.fps_sampling(cloud, n_distinct, start_idx=0)
+        order = fpsample.fps_sampling(xyz, n_distinct, start_idx=0)
     else:
-        order = fpsample.bucket_fps_kdline_sampling(cloud, n_distinct, h=KD_TREE_HEIGHT, start_idx=0)
+        order = fpsample.bucket_fps_kdline_sampling(xyz, n_distinct, h=KD_TREE_HEIGHT, start_idx=0)
     return cloud[np.resize(order, n_points)]
+
+
+def _xyz(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.ascontiguousarray(points[:, :3])

@@ -47,6 +47,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # The number of a cloud's points that the policy sees, sampled farthest point by farthest point; null for all. A
     # cloud in this order already, as those of this package's environments are, keeps its first ones.
     n_points: int | None = within(None, least=1)
+    # Whether the policy sees the points' colours: clouds (N, 6), xyz and RGB, which the dataset must hold.
+    colour: bool = False
 
     # Training from depth images, which become clouds.
     depth: DepthConfig = field(default_factory=DepthConfig)
@@ -117,7 +119,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         self.validate_sizes()
         inputs: dict[str, PolicyFeature] = self.input_features or {}
         cloud_key = find_point_cloud(inputs) or OBS_POINT_CLOUD
-        for key, shape in ((cloud_key, "(N, 3)"), (OBS_STATE, "(S,)")):
+        for key, shape in ((cloud_key, f"(N, {self.n_channels})"), (OBS_STATE, "(S,)")):
             if key not in inputs:
                 raise UserError(
                     f"Policy '{self.type}' needs the feature '{key}' of shape {shape}, "
@@ -126,16 +128,18 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         if ACTION not in (self.output_features or {}):
             raise UserError(f"Policy '{self.type}' needs the feature '{ACTION}' of shape (A,).")
         cloud, state, action = inputs[cloud_key], inputs[OBS_STATE], self.output_features[ACTION]
-        if len(cloud.shape) != 2 or cloud.shape[1] < 3 or cloud.shape[0] < (self.n_points or 1):
+        n_channels = self.n_channels
+        if len(cloud.shape) != 2 or cloud.shape[1] < n_channels or cloud.shape[0] < (self.n_points or 1):
             raise UserError(
-                f"'{cloud_key}' must have shape (N, 3) with N at least {self.n_points or 1} (policy.n_points), or more "
-                f"channels after xyz, got {tuple(cloud.shape)}."
+                f"'{cloud_key}' must have shape (N, {n_channels}) with N at least {self.n_points or 1} "
+                f"(policy.n_points), or more channels after {'xyz and RGB (policy.colour)' if self.colour else 'xyz'}, "
+                f"got {tuple(cloud.shape)}."
             )
         for key, feature in ((OBS_STATE, state), (ACTION, action)):
             if len(feature.shape) != 1:
                 raise UserError(f"'{key}' must be a vector, got shape {tuple(feature.shape)}.")
         self.input_features: dict[str, PolicyFeature] | None = {
-            OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (cloud.shape[0], 3)),
+            OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (cloud.shape[0], n_channels)),
             OBS_STATE: PolicyFeature(FeatureType.STATE, tuple(state.shape)),
         }
 
@@ -151,7 +155,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         recipe = self.depth.settle(features)
         cloud_key = find_point_cloud(features)
         if cloud_key is not None and OBS_POINT_CLOUD in (self.input_features or {}):
-            cloud = PolicyFeature(FeatureType.STATE, (features[cloud_key]["shape"][0], 3))
+            cloud = PolicyFeature(FeatureType.STATE, tuple(features[cloud_key]["shape"]))
             self.input_features = {**(self.input_features or {}), OBS_POINT_CLOUD: cloud}
         if recipe is None or cloud_key is not None:
             return
@@ -160,6 +164,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
                 f"'{self.pretrained_path}' was trained on clouds of unknown origin: the dataset needs "
                 f"'{OBS_POINT_CLOUD}', got depth images. lerobot-uca-convert makes clouds from them."
             )
+        if self.colour:
+            raise UserError("policy.colour=true needs clouds with colours (N, 6): depth images have none.")
         inputs = {key: feature for key, feature in (self.input_features or {}).items() if key not in recipe.keys}
         self.input_features = {**inputs, OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (recipe.n_points, 3))}
 
@@ -181,6 +187,11 @@ class PointCloudPolicyConfig(PreTrainedConfig):
                 raise UserError(
                     f"'{key}' must have the checkpoint's shape {tuple(before[key].shape)}, got {shape} in the dataset."
                 )
+
+    @property
+    def n_channels(self) -> int:
+        """C, numbers of a point: xyz, and RGB if the policy sees colours."""
+        return 6 if self.colour else 3
 
     @property
     def n_states(self) -> int:

@@ -23,7 +23,7 @@ runtimes arbitrary actions."""
 
 
 class Observations(NamedTuple):
-    """Point clouds (B, N, 3) and states (B, S), or (B, O, N, 3) and (B, O, S), as float32."""
+    """Point clouds (B, N, 3) and states (B, S), or (B, O, N, 3) and (B, O, S), as float32; with colours (..., N, 6)."""
 
     cloud: Tensor
     state: Tensor
@@ -71,8 +71,8 @@ def read_observations(
     steps = () if n_obs is None else (n_obs,)
     n_points = config.n_points or 1
     shape = cloud.shape
-    if len(shape) != len(steps) + 3 or shape[1:-2] != steps or shape[-2] < n_points or shape[-1] != 3:
-        expected = ", ".join(("B", *map(str, steps), "N", "3"))
+    if len(shape) != len(steps) + 3 or shape[1:-2] != steps or shape[-2] < n_points or shape[-1] != config.n_channels:
+        expected = ", ".join(("B", *map(str, steps), "N", str(config.n_channels)))
         hint = " A single sample needs a dimension for the batch: value[None]." if len(shape) == len(steps) + 2 else ""
         raise UserError(
             f"'{OBS_POINT_CLOUD}' must have shape ({expected}) with N at least {n_points}, got {tuple(shape)}.{hint}"

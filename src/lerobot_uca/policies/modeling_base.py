@@ -77,7 +77,7 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         if dataset_meta is not None and dataset_meta.stats:
             config.depth.add_statistics(dataset_meta.stats)
         encoder = ObservationEncoder(
-            config.n_states, config.point_widths, config.n_point_features, config.n_state_features
+            config.n_states, config.point_widths, config.n_point_features, config.n_state_features, config.n_channels
         )
         self.model = Model(encoder, self.make_generator())
         self.ema_model = deepcopy(self.model).requires_grad_(False)

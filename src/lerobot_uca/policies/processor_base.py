@@ -53,7 +53,7 @@ def make_processors(
         [
             steps.rename_observations,
             DepthToCloudProcessorStep(recipe=config.depth.recipe),
-            PointCloudProcessorStep(n_points=config.n_points),
+            PointCloudProcessorStep(config.n_points, config.colour),
             *augmentation_steps(config),
             steps.add_batch_dim,
             steps.to_device,
@@ -121,7 +121,7 @@ def _check_pipelines(
         kinds.insert(kinds.index(before) + 1 if before in kinds else 0, PointCloudProcessorStep)
         steps.insert(kinds.index(PointCloudProcessorStep), PointCloudProcessorStep())
     place = kinds.index(PointCloudProcessorStep)
-    steps[place].n_points = config.n_points
+    steps[place] = PointCloudProcessorStep(config.n_points, config.colour)
     pre.steps = [*steps[: place + 1], *augmentation_steps(config), *steps[place + 1 :]]
 
 
@@ -130,8 +130,8 @@ def _check_pipelines(
 class PointCloudProcessorStep(ProcessorStep):
     """Makes what datasets, environments and robots give into what the policies take.
 
-    - The cloud may stand under other plugins' names (`POINT_CLOUD_KEYS`) and have more channels than xyz, such as
-      colours; points that its mask calls invalid are replaced by valid ones.
+    - The cloud may stand under other plugins' names (`POINT_CLOUD_KEYS`) and have more channels than the policy sees,
+      such as colours; points that its mask calls invalid are replaced by valid ones.
     - A cloud of more than n_points is sampled farthest point by farthest point. One that is in this order already (as
       those of this package's environments are) keeps its first n_points.
     - Everything becomes float32: LeRobot's normaliser takes on its input's type, statistics included.
@@ -140,9 +140,11 @@ class PointCloudProcessorStep(ProcessorStep):
 
     Args:
         n_points: points of a cloud that the policy looks at; None for all.
+        colour: whether the policy looks at RGB after xyz.
     """
 
     n_points: int | None = None
+    colour: bool = False
     _has_said: bool = field(default=False, init=False, repr=False, compare=False)
 
     @override
@@ -152,12 +154,16 @@ class PointCloudProcessorStep(ProcessorStep):
         if key is None:  # the policy says what is missing
             return transition
         cloud = _as_float(observation.pop(key))
-        if cloud.ndim < 2 or cloud.shape[-1] < 3:
-            raise UserError(f"'{key}' must have shape (..., N, 3) or more channels, got {tuple(cloud.shape)}.")
-        if not self._has_said and (key != OBS_POINT_CLOUD or cloud.shape[-1] > 3):
+        n_channels = self._n_channels
+        if cloud.ndim < 2 or cloud.shape[-1] < n_channels:
+            raise UserError(
+                f"'{key}' must have shape (..., N, {n_channels}) or more channels, got {tuple(cloud.shape)}."
+            )
+        if not self._has_said and (key != OBS_POINT_CLOUD or cloud.shape[-1] > n_channels):
             self._has_said = True
-            shape = tuple(cloud.shape[-2:])
-            logger.warning("'%s' %s: its first three channels are taken as the point cloud's xyz.", key, shape)
+            shape, taken = tuple(cloud.shape[-2:]), "six" if self.colour else "three"
+            what = "xyz and RGB" if self.colour else "xyz"
+            logger.warning("'%s' %s: its first %s channels are taken as the point cloud's %s.", key, shape, taken, what)
         mask_key = valid_mask(key, observation)
         mask = None if mask_key is None else torch.as_tensor(observation.pop(mask_key))
         observation[OBS_POINT_CLOUD] = self.uniform(cloud, mask)
@@ -171,25 +177,29 @@ class PointCloudProcessorStep(ProcessorStep):
         return _with_batch(transition) if _is_single(transition) else transition
 
     def uniform(self, cloud: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Valid points' xyz, (..., N, 3) or of more points (..., n_points, 3), of clouds (..., N, C).
+        """Valid points, (..., N, 3) or of more points (..., n_points, 3), with colour 6, of clouds (..., N, C).
 
         Args:
-            cloud: float32, xyz in the first of its C channels.
+            cloud: float32, xyz and perhaps RGB in the first of its C channels.
             mask: which points are valid, (..., N); None for all.
         """
         n_points = self.n_points
-        cloud = (cloud if mask is None else _with_valid_points(cloud, mask.bool()))[..., :3]
+        cloud = (cloud if mask is None else _with_valid_points(cloud, mask.bool()))[..., : self._n_channels]
         if n_points is None or cloud.shape[-2] <= n_points:
             return cloud
         from lerobot_uca.point_clouds.geometry import subsample_farthest
 
         points = cloud.detach().cpu().numpy().reshape(-1, *cloud.shape[-2:])
         sampled = [torch.from_numpy(subsample_farthest(each, n_points)) for each in points]
-        return torch.stack(sampled).reshape(*cloud.shape[:-2], n_points, 3).to(cloud.device)
+        return torch.stack(sampled).reshape(*cloud.shape[:-2], n_points, cloud.shape[-1]).to(cloud.device)
 
     @override
     def get_config(self) -> dict[str, Any]:
-        return {"n_points": self.n_points}
+        return {"n_points": self.n_points, "colour": self.colour}
+
+    @property
+    def _n_channels(self) -> int:
+        return 6 if self.colour else 3
 
     @override
     def transform_features(
@@ -199,7 +209,7 @@ class PointCloudProcessorStep(ProcessorStep):
         key = find_point_cloud(observations)
         if key is not None:
             n_points = self.n_points or observations.pop(key).shape[0]
-            observations[OBS_POINT_CLOUD] = PolicyFeature(FeatureType.STATE, (n_points, 3))
+            observations[OBS_POINT_CLOUD] = PolicyFeature(FeatureType.STATE, (n_points, self._n_channels))
         return {**features, PipelineFeatureType.OBSERVATION: observations}
 
 

@@ -92,7 +92,7 @@ def latency_ms(policy: "PointCloudPolicy") -> float:
     device, was_training = next(policy.parameters()).device, policy.training
     n_points = config.n_points or config.input_features[OBS_POINT_CLOUD].shape[0]
     observation = {
-        OBS_POINT_CLOUD: torch.zeros(1, n_points, 3, device=device),
+        OBS_POINT_CLOUD: torch.zeros(1, n_points, config.n_channels, device=device),
         OBS_STATE: torch.zeros(1, config.n_states, device=device),
     }
     policy.eval()

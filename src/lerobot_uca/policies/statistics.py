@@ -1,6 +1,6 @@
 """Statistics for LeRobot's normalisers: those of a dataset made fit for them, and those of a checkpoint checked.
 
-Letters: D dimensions of a feature (of a point cloud 3, its statistics are per channel).
+Letters: D dimensions of a feature (of a point cloud 3, or 6 with colours: its statistics are per channel).
 """
 
 import logging
@@ -39,7 +39,11 @@ def needed_statistics(config: PointCloudPolicyConfig) -> dict[str, tuple[int, tu
     """D and the names of the statistics that the normalisation of each feature needs."""
     modes = {str(getattr(kind, "value", kind)): mode for kind, mode in config.normalization_mapping.items()}
     state, action = (NEEDED[NormalizationMode(modes.get(kind, "IDENTITY"))] for kind in ("STATE", "ACTION"))
-    return {OBS_POINT_CLOUD: (3, state), OBS_STATE: (config.n_states, state), ACTION: (config.n_actions, action)}
+    return {
+        OBS_POINT_CLOUD: (config.n_channels, state),
+        OBS_STATE: (config.n_states, state),
+        ACTION: (config.n_actions, action),
+    }
 
 
 def settled_statistics(
@@ -69,7 +73,9 @@ def settled_statistics(
     cloud_key = find_point_cloud(named)
     if cloud_key is not None:
         channels = {name: _vector(values) for name, values in named[cloud_key].items()}
-        named[OBS_POINT_CLOUD] = {name: values if name == "count" else values[:3] for name, values in channels.items()}
+        named[OBS_POINT_CLOUD] = {
+            name: values if name == "count" else values[: config.n_channels] for name, values in channels.items()
+        }
     settled: Statistics = {}
     constant: list[str] = []
     for key, (_, names) in needed_statistics(config).items():

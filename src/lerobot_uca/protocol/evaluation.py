@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import OBS_STATE, OBS_STR
 from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_uca.envs.point_cloud_env import Observation, PointCloudEnv
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import ENV_NAMES
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
@@ -161,12 +161,10 @@ class PolicyPlan:
         histories = [episode.history() for episode in running]
         noise = [torch.randn(config.horizon, config.n_actions, generator=episode.noise) for episode in running]
         with torch.inference_mode():
-            batch = self.preprocess(
-                {
-                    OBS_POINT_CLOUD: _stack(histories, "point_cloud"),  # (E, O, N, 3)
-                    OBS_STATE: _stack(histories, "agent_pos"),  # (E, O, S)
-                }
-            )
+            observed = {  # such as (E, O, N, 3) and (E, O, S)
+                ENV_NAMES.get(name, f"{OBS_STR}.{name}"): _stack(histories, name) for name in histories[0][0]
+            }
+            batch = self.preprocess(observed)
             noise_on_device = torch.stack(noise).to(batch[OBS_STATE].device)
             actions = self.policy.predict_action_chunk(batch, noise=noise_on_device)
             return self.postprocess(actions).to("cpu", torch.float32).numpy()

@@ -82,7 +82,7 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
         actions = postprocess(policy.predict_action_chunk({**batch, OBS_POINT_CLOUD: cloud}, noise=noise))
     return Moments(
         steps=steps,
-        points=raw[OBS_POINT_CLOUD][:, -1, : cloud.shape[2]].numpy(),
+        points=raw[OBS_POINT_CLOUD][:, -1, : cloud.shape[2], :3].numpy(),
         saliency=(values / values.amax(dim=1, keepdim=True).clamp_min(1e-12)).numpy(),
         states=raw[OBS_STATE][:, -1].numpy(),
         actions=actions.numpy(),

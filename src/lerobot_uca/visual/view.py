@@ -52,6 +52,8 @@ class ViewConfig:
     crop_low: tuple[float, float, float] | None = None
     # Highest corner of the crop [m].
     crop_high: tuple[float, float, float] | None = None
+    # Show the points' own colours, if the source has some.
+    colour: bool = False
     # Folder of the cameras' calibrations; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
     # Training configuration whose policy.depth.crop_low and crop_high the page's button writes; made if need be.
@@ -65,7 +67,7 @@ class ViewConfig:
 
 
 def clouds_of(config: ViewConfig) -> Iterator[NDArray[np.float32]]:
-    """The points of each frame of an episode, (M, 3) [m], also those outside the crop.
+    """The points of each frame of an episode, (M, 3) [m], with colours (M, 6), also those outside the crop.
 
     Raises:
         UserError: if there is neither a source nor an environment, or if it cannot be read.
@@ -83,7 +85,7 @@ def clouds_of(config: ViewConfig) -> Iterator[NDArray[np.float32]]:
         return
     assert config.source is not None
     try:
-        source = find_source(config.source, None, "")
+        source = find_source(config.source, None, "", colour=config.colour)
         if isinstance(source, LeRobotSource) and depth_keys(source.features):
             source.depth_recipe = recipe_for(
                 source.features, (WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration
@@ -103,13 +105,18 @@ def crop_of(config: ViewConfig, points: NDArray[np.float32]) -> Crop:
             return make_crop(config.crop_low, config.crop_high)
         except CalibrationError as error:
             raise UserError(str(error)) from error
-    low, high = (np.round(np.percentile(points, share, axis=0), 2).tolist() for share in (1, 99))
+    low, high = (np.round(np.percentile(points[:, :3], share, axis=0), 2).tolist() for share in (1, 99))
     return Crop((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
 def colours_of(points: NDArray[np.float32], crop: Crop) -> NDArray[np.uint8]:
-    """Blue inside the crop, grey outside, (M, 3)."""
-    return np.where(crop.contains(points)[:, None], INSIDE, OUTSIDE).astype(np.uint8)
+    """RGB of points (M, 3) or (M, 6), (M, 3): blue or their own inside the crop, grey outside.
+
+    Colours above 1 are taken as 0 to 255, others as 0 to 1.
+    """
+    own = points[:, 3:6]
+    inside = own * (1 if own.max(initial=0) > 1 else 255) if own.shape[1] else np.array(INSIDE)
+    return np.where(crop.contains(points[:, :3])[:, None], inside, OUTSIDE).clip(0, 255).astype(np.uint8)
 
 
 def write_crop(file: Path, crop: Crop) -> None:
@@ -157,7 +164,7 @@ def record(file: Path, clouds: Iterator[NDArray[np.float32]], crop: Crop) -> Non
     recording.save(str(file))
     for index, points in enumerate(clouds):
         recording.set_time("frame", sequence=index)
-        recording.log("cloud", rerun.Points3D(points, colors=colours_of(points, crop), radii=0.003))
+        recording.log("cloud", rerun.Points3D(points[:, :3], colors=colours_of(points, crop), radii=0.003))
     recording.flush()
 
 
@@ -168,7 +175,7 @@ def serve(config: ViewConfig, clouds: list[NDArray[np.float32]], crop: Crop) -> 
     except ImportError as error:
         raise UserError("The page needs viser: pip install 'lerobot_policy_uca_flow[view]'.") from error
     server = viser.ViserServer(host="127.0.0.1", port=config.port, verbose=False)
-    everything = np.concatenate(clouds)
+    everything = np.concatenate(clouds)[:, :3]
     low, high = everything.min(axis=0), everything.max(axis=0)
     frame = server.gui.add_slider("frame", min=0, max=max(1, len(clouds) - 1), step=1, initial_value=0)
     sliders = [
@@ -191,8 +198,8 @@ def serve(config: ViewConfig, clouds: list[NDArray[np.float32]], crop: Crop) -> 
 
     def show(_: Any = None) -> None:
         points = clouds[min(int(frame.value), len(clouds) - 1)]
-        server.scene.add_point_cloud("/cloud", points, colours_of(points, chosen()), point_size=0.004)
-        status.content = f"{int(chosen().contains(points).sum())} of {len(points)} points are inside the crop"
+        server.scene.add_point_cloud("/cloud", points[:, :3], colours_of(points, chosen()), point_size=0.004)
+        status.content = f"{int(chosen().contains(points[:, :3]).sum())} of {len(points)} points are inside the crop"
 
     def write(_: Any) -> None:
         write_crop(config.config, chosen())
