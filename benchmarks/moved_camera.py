@@ -69,13 +69,14 @@ def row(checkpoint: Path, env: Any, error: tuple[float, float], n_episodes: int)
 
 def episodes(plan: PolicyPlan, env: Any, error: tuple[float, float], n_episodes: int) -> Iterator[bool]:
     """Whether each episode succeeds."""
-    steps = plan.preprocess.steps
+    preprocess: Any = plan.preprocess
+    steps = preprocess.steps
     place = next(index for index, step in enumerate(steps) if isinstance(step, DepthToCloudProcessorStep))
     trained = CloudRecipe.from_dict(steps[place].recipe)
     seeds = range(FIRST_SEED, FIRST_SEED + n_episodes)
     for first in seeds[::GROUP]:
         recipe = miscalibrated(trained, *error, np.random.default_rng(first))
-        plan.preprocess.steps = [*steps[:place], DepthToCloudProcessorStep(recipe.as_dict()), *steps[place + 1 :]]
+        preprocess.steps = [*steps[:place], DepthToCloudProcessorStep(recipe.as_dict()), *steps[place + 1 :]]
         group = range(first, min(first + GROUP, seeds.stop))
         for episode in run_episodes(env.env_factory(env.task), plan.config, plan, group, n_envs=GROUP):
             yield episode.success
