@@ -26,7 +26,7 @@ def controller() -> Iterator[Controller]:
         yield controller
 
 
-def wait_until(condition: Callable[[], object], seconds: float = 10.0) -> None:
+def wait_until(condition: Callable[[], object], seconds: float = 30.0) -> None:
     """Return as soon as a condition holds; fail if it never does."""
     deadline = time.monotonic() + seconds
     while not condition():

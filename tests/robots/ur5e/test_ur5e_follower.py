@@ -22,7 +22,7 @@ from lerobot_uca.robots.ur5e.channel import ArmStoppedError
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
 from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_to_vector
 from lerobot_uca.robots.ur5e.sim.controller import Controller
-from lerobot_uca.robots.ur5e.sim.robot import Runtime
+from lerobot_uca.robots.ur5e.sim.robot import Command, IdealArm, Runtime
 from lerobot_uca.robots.ur5e.ur5e_follower import GRIPPER_KEY, JOINT_KEYS, TCP_KEYS, ClippingReport, UR5eFollower
 
 pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
@@ -53,6 +53,25 @@ def stands_still(controller) -> bool:
 
 def speed(controller) -> float:
     return np.abs(controller.robot.arm.qd).max()
+
+
+def keep_setpoints(controller) -> list[list[float]]:
+    """Every target that the controller's `servoj` is given from now on: free of this machine's own pauses."""
+    setpoints = []
+    receive = controller.robot.receive
+
+    def keep(values):
+        if values["input_int_register_0"] == Command.SERVO_J:
+            setpoints.append([values[f"input_double_register_{joint}"] for joint in range(6)])
+        receive(values)
+
+    controller.robot.receive = keep
+    return setpoints
+
+
+def fastest(setpoints, robot) -> float:
+    """The largest velocity of a joint's setpoints [rad/s]."""
+    return np.abs(np.diff(setpoints, axis=0)).max() * robot.config.servo_rate
 
 
 def stream(robot, velocity, seconds=2.0, rate=30.0):
@@ -103,23 +122,20 @@ def test_actions_are_carried_out(controller, robot):
 
 def test_a_stream_is_followed_within_the_tracking_error_of_its_lags(controller, robot):
     """Interpolation, limits and servoj lag behind by known times; nothing else is lost."""
-    velocity, config = 0.3, robot.config
-    last = stream(robot, velocity, seconds=1.5)
+    velocity, config, errors = 0.3, robot.config, []
+    for _ in range(25):
+        last = stream(robot, velocity, seconds=0.067)
+        errors.append(np.abs(last - controller.robot.arm.q).max())
     lag = 1 / 30 + velocity / (2 * config.max_acceleration) + config.servo_lookahead  # [s]
-    error = np.abs(last - controller.robot.arm.q).max()
-    assert error < velocity * (lag + 0.1)
+    assert np.median(errors) < velocity * (lag + 0.1)  # of a single one, this machine may have more
     wait_until(lambda: np.abs(last - controller.robot.arm.q).max() < 2e-3)
 
 
 def test_the_first_action_is_eased_to_and_far_ones_are_clipped_and_said(controller, robot, caplog):
-    fastest = [0.0]
+    setpoints = keep_setpoints(controller)
     target = HOME + np.array([0.6, 0, 0, 0, 0, 0])
-    thread = threading.Thread(target=robot.send_action, args=(action_at(target),))
-    thread.start()
-    while thread.is_alive():
-        fastest.append(speed(controller))
-        thread.join(0.01)
-    assert max(fastest) < robot.config.ease_velocity * 1.2
+    robot.send_action(action_at(target))
+    assert fastest(setpoints, robot) < robot.config.ease_velocity * 1.05
     assert np.abs(controller.robot.arm.q - target).max() < 4e-3
     assert "0.60 rad away (shoulder_pan): easing there" in caplog.text
     commanded = robot.send_action(action_at(target + 1.0))
@@ -128,14 +144,29 @@ def test_the_first_action_is_eased_to_and_far_ones_are_clipped_and_said(controll
     assert "1 targets were clipped, by up to" in caplog.text
 
 
+class HeldArm(IdealArm):
+    """An arm that leans on something."""
+
+    def follow(self, target_q, dt):
+        super().follow(np.minimum(target_q, HOME + 0.02), dt)
+
+
+def test_an_arm_that_something_holds_goes_on_and_it_is_said(tmp_path, caplog):
+    """As at a drawer's end, where a recording saves an episode and the arm pauses."""
+    with Controller(HeldArm(), address=free_address()) as controller:
+        robot = make_robot(controller, tmp_path, gripper="none")
+        with robot:
+            robot.send_action(dict(zip(JOINT_KEYS, HOME + np.eye(6)[2] * 0.05, strict=True)))
+    assert "The arm is held 0.030 rad away from the first target (elbow)." in caplog.text
+
+
 def test_velocity_is_limited_whatever_is_asked(controller, robot):
     robot.send_action(action_at(HOME))
-    fastest = []
+    setpoints = keep_setpoints(controller)
     for step in range(45):  # LeRobot's rollout returns to its start in a fixed time, whatever the distance
         robot.send_action(action_at(HOME + np.array([0.2 * step, 0, 0, 0, 0, 0]).clip(max=1.5)))
-        fastest.append(speed(controller))
         time.sleep(1 / 30)
-    assert max(fastest) < robot.config.max_velocity * 1.2
+    assert fastest(setpoints, robot) < robot.config.max_velocity * (1 + 1e-9)
     assert not controller.robot.stop_reason
 
 
@@ -162,7 +193,7 @@ def test_tcp_actions_move_the_tool_in_the_base_frame(controller, tmp_path):
 
 
 def test_without_actions_the_arm_holds_then_stops_and_eases_in_again(controller, tmp_path, caplog):
-    robot = make_robot(controller, tmp_path, stop_after=0.3)
+    robot = make_robot(controller, tmp_path, stop_after=1.0)
     with robot:
         robot.send_action(action_at(HOME + 0.02))
         wait_until(lambda: "the arm has stopped" in caplog.text)

@@ -96,5 +96,5 @@ RANGES = {
     "max_acceleration": (0.1, 40),
     "max_step": (0.001, 1),
     "ease_velocity": (0.01, 1),
-    "stop_after": (0.1, 60),
+    "stop_after": (0.5, 60),
 }

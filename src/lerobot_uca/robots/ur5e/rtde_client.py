@@ -30,6 +30,7 @@ from lerobot_uca.robots.ur5e.channel import (
     encode,
 )
 from lerobot_uca.robots.ur5e.limits import Interpolator
+from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 
 # [s] Without new data from the controller: first the setpoint stays where it is, then this ends. A busy computer may
 # well wait for half a second, and its arm stands still meanwhile.
@@ -183,6 +184,7 @@ class ServoLoop:
 
 def main() -> None:
     """Runs until the driver stops it."""
+    prefer_this_thread()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the driver, which then stops the arm in order
     channel = Channel(int(sys.argv[1]))
     loop = None

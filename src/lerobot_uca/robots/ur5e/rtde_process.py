@@ -59,7 +59,7 @@ class RtdeProcess:
         self._reader.start()
         self._send(settings)
         try:
-            self.wait_for(lambda state: state is not None, START_TIMEOUT, f"An answer from {settings.ip}")
+            self.wait_for(lambda _: True, START_TIMEOUT, f"An answer from {settings.ip}")
         except BaseException:
             self.kill()
             raise
@@ -85,7 +85,7 @@ class RtdeProcess:
                 logger.warning(message.text)
             self._changed.notify_all()
 
-    def wait_for(self, condition: Callable[[State | None], bool], timeout: float, what: str) -> State | None:
+    def wait_for(self, condition: Callable[[State], bool], timeout: float, what: str) -> State:
         """The first state that meets a condition. Raises `ArmStoppedError` where none does or the arm stops.
 
         Args:
@@ -94,9 +94,10 @@ class RtdeProcess:
             what: is waited for, for the message.
         """
         with self._changed:
-            if not self._changed.wait_for(lambda: self._failure or condition(self._state), timeout):
+            if not self._changed.wait_for(lambda: self._failure or (self._state and condition(self._state)), timeout):
                 raise ArmStoppedError(f"{what} did not come within {timeout:.0f} s.")
             self._raise_failure()
+            assert self._state is not None  # a condition was met by one
             return self._state
 
     def state(self) -> State:

@@ -37,6 +37,7 @@ GRIPPER_KEY = "gripper.pos"
 
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
 ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
+SETTLING = 0.4  # [s], after which an arm whose setpoint is at the first target is as near as it gets
 NOTICEABLE = 1e-3  # [rad]: what is clipped by less is not worth a line
 
 logger = logging.getLogger(__name__)
@@ -217,10 +218,18 @@ class UR5eFollower(Robot):
             logger.warning("The first target is %.2f rad away (%s): easing there in %.0f s.", distance, joint, duration)
         self._arm.send(Target(tuple(target.tolist()), duration))
 
-        def has_arrived(state: State | None) -> bool:
-            return state is not None and state.is_servoing and np.abs(np.array(state.q) - target).max() < ARRIVED
+        settled_at = math.inf
 
-        self._arm.wait_for(has_arrived, 2 * duration + 5, "The pose of the first action")
+        def is_there(state: State) -> bool:
+            nonlocal settled_at
+            if state.is_servoing and state.has_arrived:
+                settled_at = min(settled_at, time.monotonic() + SETTLING)
+            return time.monotonic() > settled_at or (state.is_servoing and _distance(state, target).max() < ARRIVED)
+
+        away = _distance(self._arm.wait_for(is_there, 2 * duration + 5, "The pose of the first action"), target)
+        if away.max() > ARRIVED:
+            joint = JOINTS[int(away.argmax())]
+            logger.warning("The arm is held %.3f rad away from the first target (%s).", away.max(), joint)
 
     def disconnect(self) -> None:
         """The arm brakes and stands still; its program ends."""
@@ -233,6 +242,12 @@ class UR5eFollower(Robot):
         for camera in self.cameras.values():
             if camera.is_connected:
                 camera.disconnect()
+
+
+def _distance(state: State, target: Array) -> Array:
+    """How far each joint is from a target, (6,) [rad]."""
+    distance: Array = np.abs(np.array(state.q) - target)
+    return distance
 
 
 def _tool(state: State) -> Array:

@@ -22,7 +22,7 @@ from dashboard_client import DashboardClient
 address = sys.argv[1]
 def connect():
     return RTDEReceiveInterface(address, 500), RTDEControlInterface(address, 500)
-def wait_until(condition, seconds=8):
+def wait_until(condition, seconds=20):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline
@@ -38,7 +38,7 @@ def start_client(controller: Controller, code: str) -> subprocess.Popen:
 
 
 def run_client(controller: Controller, code: str) -> str:
-    output, _ = (client := start_client(controller, code)).communicate(timeout=40)
+    output, _ = (client := start_client(controller, code)).communicate(timeout=90)
     assert client.returncode == 0, output
     return output
 
@@ -56,7 +56,7 @@ def test_a_client_reads_servos_and_stops(controller):
             start = control.initPeriod()
             assert control.servoJ(target, 0, 0, 0.002, 0.1, 300)
             control.waitPeriod(start)
-        assert near(receive.getActualQ(), target, 1e-3)
+        wait_until(lambda: near(receive.getActualQ(), target, 1e-3))
         assert control.servoStop(10)
         control.stopScript()
         assert not control.isProgramRunning()
@@ -76,7 +76,7 @@ def test_a_client_moves_stops_and_starts_anew(controller):
         target = [angle + 0.2 for angle in q]
         assert control.moveJ(target, 2.0, 10.0)
         wait_until(lambda: near(receive.getActualQ(), target, 1e-6))
-        assert control.moveJ(q, 0.5, 2.0, True) and control.getAsyncOperationProgress() >= 0
+        assert control.moveJ(q, 0.02, 2.0, True) and control.getAsyncOperationProgress() >= 0
         control.stopJ(10.0)
         assert not near(receive.getActualQ(), q, 1e-2)
         assert control.getStepTime() == 0.002
@@ -141,7 +141,7 @@ def test_the_dashboard_unlocks_a_protective_stop_after_five_seconds(controller):
     lines = iter(client.stdout.readline, "")
     assert "refused\n" in lines
     now[0] = 5.1
-    output, _ = client.communicate("\n", timeout=20)
+    output, _ = client.communicate("\n", timeout=60)
     assert client.returncode == 0, output
 
 
@@ -150,7 +150,7 @@ def test_the_watchdog_stops_the_program_of_a_killed_client(controller):
         controller,
         """
         receive, control = connect()
-        control.setWatchdog(10)
+        control.setWatchdog(2)
         target = receive.getActualQ()
         print("ready", flush=True)
         while True:
@@ -162,7 +162,7 @@ def test_the_watchdog_stops_the_program_of_a_killed_client(controller):
     assert controller.robot.runtime == Runtime.PLAYING
     client.kill()
     client.communicate()
-    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED, seconds=2)
+    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
 
 
 def test_an_emergency_stop_is_seen_as_one(controller):
@@ -178,7 +178,7 @@ def test_an_emergency_stop_is_seen_as_one(controller):
     assert client.stdout.readline() == "ready\n"
     with controller.robot.lock:
         controller.robot.emergency_stop()
-    output, _ = client.communicate(timeout=20)
+    output, _ = client.communicate(timeout=60)
     assert client.returncode == 0, output
     assert controller.robot.safety == Safety.ROBOT_EMERGENCY_STOP
 

@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from lerobot_uca.point_clouds.calibration import Calibration
+from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 from lerobot_uca.robots.ur5e.sim.controller import Controller
 from lerobot_uca.robots.ur5e.sim.scene import TASKS, TOOL_LENGTH, Scene
 from lerobot_uca.robots.ur5e.sim.scene_service import FAULTS, PORT, SERIAL, Noise, SceneService, simulated_camera
@@ -76,6 +77,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 def main() -> None:
     """Serve until Ctrl-C."""
     options = parse()
+    prefer_this_thread()  # the simulated world's time is the real one
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if options.calibration is not None:
         file = write_calibration(options.calibration, options.camera, options.width, options.height)

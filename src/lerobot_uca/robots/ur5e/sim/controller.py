@@ -6,6 +6,7 @@ from types import TracebackType
 from typing import Self
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 from lerobot_uca.robots.ur5e.sim import servers
 from lerobot_uca.robots.ur5e.sim.gripper import Fingers, SimulatedGripper
 from lerobot_uca.robots.ur5e.sim.robot import CYCLE, Arm, IdealArm, Robot
@@ -66,6 +67,7 @@ class Controller:
         self._clock.start()
 
     def _run(self) -> None:
+        prefer_this_thread()
         due = time.monotonic()
         while not self._closing.is_set():
             with self.robot.lock:

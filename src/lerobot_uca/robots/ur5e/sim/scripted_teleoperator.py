@@ -22,8 +22,11 @@ from lerobot_uca.robots.ur5e.ur5e_follower import GRIPPER_KEY, JOINT_KEYS
 class ScriptedTeleoperator(Teleoperator):
     """Alternates between a demonstration and a reset, as `lerobot-record` does.
 
-    LeRobot tells a teleoperator nothing about episodes. So both last the times that the recording was given, from the
-    first action that is asked for in each: demonstration, holding still, then home with new places for the things.
+    LeRobot tells a teleoperator nothing about episodes. So both last the times that the recording was given:
+    demonstration, holding still, then home with new places for the things. A phase that begins two steps late leaves
+    the arm still for so long. One that began a step early, in the reset's last one, would be over by the time that
+    LeRobot needs to save before the episode's end, and the next ones ever earlier. Hence late ones, which are counted
+    from their second step.
     """
 
     config_class = ScriptedTeleoperatorConfig
@@ -82,9 +85,11 @@ class ScriptedTeleoperator(Teleoperator):
         """The next row of the path; its last one until the time is over."""
         config, now = self.config, self._clock()
         lasts = config.episode_time_s if self._is_demonstrating else config.reset_time_s
-        if now - self._began > lasts - 0.5 / config.fps:
+        if now - self._began > lasts + 1 / config.fps:
             self._begin_reset() if self._is_demonstrating else self._begin_demonstration()
-            self._began, self._n_sent = now, 0
+            self._n_sent = 0
+        if self._n_sent <= 1:
+            self._began = now
         # A row for each call, not for each moment: a computer that falls behind makes the motion slower, never jerky.
         row = self._last = self._path[min(self._n_sent, len(self._path) - 1)]
         self._n_sent += 1
