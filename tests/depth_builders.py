@@ -1,5 +1,6 @@
 """A camera, what it sees, and tiny datasets of it."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,9 +47,21 @@ def live_frame(seed: int) -> np.ndarray:
 
 
 def write_depth_dataset(
-    root: Path, *, video: bool, n_episodes: int = 2, length: int = 6, **info: object
+    root: Path,
+    *,
+    video: bool,
+    n_episodes: int = 2,
+    length: int = 6,
+    columns: dict[str, Callable[[int], np.ndarray]] | None = None,
+    **info: object,
 ) -> LeRobotDataset:
-    """Depth images `live_frame(index)`, states and actions, as lerobot-record writes them."""
+    """Depth images `live_frame(index)`, states and actions, as lerobot-record writes them.
+
+    Args:
+        columns: further features, which give a frame's values for its index.
+        info: of the depth images.
+    """
+    columns = columns or {}
     rng = np.random.default_rng(0)
     names = ["height", "width", "channels"]
     features = {
@@ -60,6 +73,7 @@ def write_depth_dataset(
         },
         "observation.state": {"dtype": "float32", "shape": (N_STATES,), "names": None},
         "action": {"dtype": "float32", "shape": (N_ACTIONS,), "names": None},
+        **{key: {"dtype": "float32", "shape": of(0).shape, "names": None} for key, of in columns.items()},
     }
     dataset = LeRobotDataset.create("test/depth", fps=20, features=features, root=root, use_videos=video)
     for index in range(n_episodes * length):
@@ -67,6 +81,7 @@ def write_depth_dataset(
             key: rng.normal(size=shape).astype(np.float32)
             for key, shape in (("observation.state", N_STATES), ("action", N_ACTIONS))
         }
+        values |= {key: of(index).astype(np.float32) for key, of in columns.items()}
         dataset.add_frame({DEPTH_KEY: live_frame(index), **values, "task": "push"})
         if index % length == length - 1:
             dataset.save_episode()

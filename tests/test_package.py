@@ -26,7 +26,7 @@ ALLOWED = {
     "envs": {"bounds", "point_clouds", "errors", "features", "registry"},
     "data": {"bounds", "envs", "point_clouds", "errors", "features", "hub", "processes"},
     "robots": {"point_clouds", "errors", "features", "registry", "processes"},
-    "visual": {"bounds", "policies", "data", "envs", "point_clouds", "errors", "features"},
+    "visual": {"bounds", "policies", "data", "envs", "robots", "point_clouds", "errors", "features"},
     "deploy": {"policies", "inference", "errors", "features"},
     "protocol": {"policies", "data", "envs", "errors", "features", "processes"},
     "checkpoints": {"data", "errors"},

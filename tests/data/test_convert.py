@@ -14,6 +14,7 @@ from tests.depth_builders import (
     N_CLOUD_POINTS,
     live_frame,
     make_calibration,
+    make_camera,
     make_recipe,
     write_depth_dataset,
 )
@@ -188,6 +189,60 @@ def test_the_layout_of_lerobots_open_pull_request(tmp_path, colours, caplog):
     assert "Not kept: observation.intrinsics.front, observation.extrinsics.front." in caplog.messages
 
 
+def write_with_calibration(root, pose_of=lambda index: np.array(make_camera().X_world_camera), focal_of=lambda _: 57.6):
+    """Depth beside its camera's calibration, in the layout of LeRobot's PR 4696."""
+    camera = make_camera()
+
+    def intrinsics(index):
+        return np.array([[focal_of(index), 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+
+    columns = {"observation.intrinsics.front": intrinsics, "observation.extrinsics.front": pose_of}
+    return write_depth_dataset(root, video=False, n_episodes=1, length=3, columns=columns)
+
+
+def test_a_calibration_beside_the_depth_is_used(tmp_path, monkeypatch, caplog):
+    """PR 4696: intrinsics (3, 3) and extrinsics (4, 4), camera to world, in each frame."""
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+    source = write_with_calibration(tmp_path / "source")
+    dataset = convert(config(source.root, tmp_path / "clouds"))
+    assert "Calibrations in the dataset are used: camera front." in caplog.text
+    assert "Not kept" not in caplog.text
+    recipe = CloudRecipe.from_dict(dataset.features[OBS_POINT_CLOUD]["info"][RECIPE_INFO])
+    camera, expected = recipe.sources[0].calibration.camera, make_camera()
+    assert (camera.width, camera.height) == (expected.width, expected.height)
+    np.testing.assert_allclose([camera.fx, camera.fy, camera.cx, camera.cy], [57.6, expected.fy, 30.72, 24.48])
+    np.testing.assert_allclose(camera.X_world_camera, expected.X_world_camera, atol=1e-7)
+    for index in range(3):
+        np.testing.assert_array_equal(dataset[index][OBS_POINT_CLOUD], recipe.make()([live_frame(index)]))
+        np.testing.assert_allclose(
+            dataset[index][OBS_POINT_CLOUD], make_recipe().make()([live_frame(index)]), atol=1e-5
+        )
+
+
+def test_a_calibration_beside_the_depth_must_be_right(tmp_path, monkeypatch):
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+
+    def moving(index):
+        pose = np.array(make_camera().X_world_camera)
+        pose[0, 3] += 0.02 * index
+        return pose
+
+    wrong = {
+        "Camera 'front' moves by 40.0 mm and 0.00 deg in the dataset": {"pose_of": moving},
+        "observation.intrinsics.front' must be the same in all frames": {"focal_of": lambda index: 57 + index},
+        "pose must hold a rotation": {"pose_of": lambda _: np.diag([2.0, 1, 1, 1])},
+    }
+    for number, (message, each) in enumerate(wrong.items()):
+        source = write_with_calibration(tmp_path / str(number), **each)
+        with pytest.raises(UserError, match=message):
+            convert(config(source.root, tmp_path / "clouds"))
+    make_calibration(make_camera(position=(-0.2, 0.05, 0.7))).write(tmp_path / "mine")
+    source = tmp_path / "0"
+    dataset = convert(config(source, tmp_path / "clouds", calibration=str(tmp_path / "mine")))  # what is given counts
+    recipe = CloudRecipe.from_dict(dataset.features[OBS_POINT_CLOUD]["info"][RECIPE_INFO])
+    assert recipe.sources[0].calibration.camera.position[0] == -0.2
+
+
 def write_folder(folder, kind, *, n_frames=4):
     plyfile = pytest.importorskip("plyfile")
     rng = np.random.default_rng(0)
@@ -296,6 +351,20 @@ def test_wrong_sources(tmp_path, depth_dataset, monkeypatch):
     for message, each in wrong.items():
         with pytest.raises(UserError, match=message):
             convert(each)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_crop_that_leaves_nothing_says_what_it_covers(depth_dataset, tmp_path, calibrated):
+    elsewhere = {"crop_low": (0.2, 5.0, 0.01), "crop_high": (0.9, 6.0, 0.4)}
+    with pytest.raises(
+        UserError, match=r"the first is frame 0 with 0. Camera 'front' has .* y of 0%, z of \d\d%. Move"
+    ):
+        convert(config(depth_dataset.root, tmp_path / "out", **elsewhere))
+    write_folder(tmp_path / "recorded", "npz")
+    with pytest.raises(
+        UserError, match=r"frame 0 with 0. The cloud has 190 finite points from \[0.1.*; the crop is \(0.2"
+    ):
+        convert(config(tmp_path / "recorded", tmp_path / "out", fps=5, **elsewhere))
     assert not (tmp_path / "out").exists()
 
 

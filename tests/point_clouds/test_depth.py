@@ -133,11 +133,22 @@ def test_depth_in_other_units_is_named():
     view = DepthView(camera(), unit=1e-3)
     make = DepthToCloud([view], CROP, 64)
     metres = scene(view.camera).astype(np.float32)
-    with pytest.raises(DepthError, match=r"its median is 1.0.* units of 0.001 m, and would fit metres"):
+    with pytest.raises(DepthError, match=r"its median is 1.0.* units of 0.001 m. In units of 1 m camera 'front' would"):
         make([metres])
     in_metres = dataclasses.replace(view, unit=1.0)
-    with pytest.raises(DepthError, match=r"its median is 10.* units of 1 m, and would fit millimetres"):
+    with pytest.raises(DepthError, match=r"its median is 10.* units of 1 m. In units of 1 mm camera 'front' would"):
         DepthToCloud([in_metres], CROP, 64)([to_millimetres(metres)])
+
+
+@pytest.mark.parametrize(("unit", "name"), [(2.5e-4, "0.25 mm"), (1e-4, "0.1 mm")])
+def test_depth_in_a_cameras_own_unit_is_named(unit, name):
+    """Four and ten times too far, but still a depth that a room may have: the crop tells."""
+    view = DepthView(camera(), unit=1e-3)
+    depth = np.full((48, 64), round(0.9 / unit), np.uint16)
+    n_points = len(DepthToCloud([dataclasses.replace(view, unit=unit)], CROP, 64).points([depth]))
+    message = f"In units of {name} camera 'front' would have {n_points} points inside the crop: check its depth_unit"
+    with pytest.raises(DepthError, match=message):
+        DepthToCloud([view], CROP, 64)([depth])
 
 
 def test_a_covered_camera_is_named():
@@ -178,6 +189,8 @@ def test_whole_millimetres():
 
 def test_what_a_camera_sees_is_described_in_the_base_frame():
     view = DepthView(camera(), unit=1e-3)
-    text = describe(view, np.full((48, 64), 800, np.uint16))
+    text = describe(view, np.full((48, 64), 800, np.uint16), CROP)
     points = view.camera.unproject(np.full((48, 64), 0.8))
     assert str(np.round(np.percentile(points, 1, axis=0), 3).tolist()) in text
+    shares = [round(100 * share) for share in ((points >= CROP.low) & (points <= CROP.high)).mean(axis=0)]
+    assert text.endswith("of its points the crop holds the x of {}%, y of {}%, z of {}%".format(*shares))

@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.scripts import lerobot_train
-from tests.builders import N_STATES, SMALL_POLICIES
+from tests.builders import N_STATES, SMALL_POLICIES, make_config, make_statistics
 from tests.depth_builders import (
     CROP,
     DEPTH_KEY,
@@ -30,6 +30,7 @@ from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, CloudRecipe, c
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.depth_config import DepthConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from lerobot_uca.policies.processor_base import make_processors
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
 
 LOG_STEP = (np.log(13.5) - np.log(3.51)) / 4095
@@ -212,7 +213,7 @@ def test_wrong_images_are_told_in_one_line():
         step().observation({DEPTH_KEY: torch.zeros(1, 1, 20, 20)})
     with pytest.raises(UserError, match="every pixel is 0 or NaN"):
         step().observation({DEPTH_KEY: torch.zeros(1, 1, 48, 64)})
-    with pytest.raises(UserError, match="would fit metres"):
+    with pytest.raises(UserError, match="In units of 1 m camera 'front' would have"):
         step().observation({DEPTH_KEY: torch.full((1, 1, 48, 64), 0.8)})
 
 
@@ -241,6 +242,28 @@ def test_another_installation_uses_its_own_calibration_and_says_how_far_it_is(ca
     cloud = there.observation({DEPTH_KEY: live_frame(0)})[OBS_POINT_CLOUD].numpy()
     np.testing.assert_array_equal(cloud, pure_cloud(0, make_recipe(camera=moved.camera)))
     assert there.get_config()["recipe"] == make_recipe().as_dict()  # the checkpoint still knows its own
+
+
+def test_a_folder_of_calibrations_may_be_named_when_a_checkpoint_is_loaded(tmp_path, caplog, monkeypatch):
+    """lerobot-eval and lerobot-rollout with --policy.depth.calibration."""
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+    checkpoint, trained = tmp_path / "checkpoint", make_config(depth=DepthConfig(recipe=make_recipe().as_dict()))
+    UCAFlowPolicy(trained).save_pretrained(checkpoint)
+    for processors in make_processors(trained, make_statistics()):
+        processors.save_pretrained(checkpoint)
+    other = make_calibration(moved_camera(30))
+    other.write(tmp_path / "other")
+    config = UCAFlowConfig.from_pretrained(checkpoint, cli_overrides=[f"--depth.calibration={tmp_path / 'other'}"])
+    caplog.clear()
+    preprocess, _ = make_pre_post_processors(config, pretrained_path=str(checkpoint))
+    assert "training, camera 'front' is 30.0 mm and 0.00 deg from where it was." in caplog.text
+    cloud = preprocess(as_rollout_gives(0))[OBS_POINT_CLOUD][0].numpy()
+    np.testing.assert_allclose(cloud, pure_cloud(0, make_recipe(camera=other.camera)), atol=1e-6)
+    step = next(each for each in preprocess.steps if isinstance(each, DepthToCloudProcessorStep))
+    assert step.get_config() == {"recipe": make_recipe().as_dict()}  # no path of this machine
+    config.depth.calibration = str(tmp_path / "missing")
+    with pytest.raises(UserError, match="missing' must be a folder of calibrations"):
+        make_pre_post_processors(config, pretrained_path=str(checkpoint))
 
 
 def test_without_an_installation_the_calibration_of_training_is_used_and_told(caplog):

@@ -1,18 +1,31 @@
 """Looking at clouds."""
 
+import base64
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
 import sys
 import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 from tests.depth_builders import CROP, live_frame, make_calibration, make_recipe, write_depth_dataset
+from tests.robots.conftest import wait_until
 
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE
 from lerobot_uca.visual import view as command
-from lerobot_uca.visual.view import ViewConfig, clouds_of, colours_of, view, write_crop
+from lerobot_uca.visual.crop_page import INSIDE, OUTSIDE, colours_of, write_crop
+from lerobot_uca.visual.view import ViewConfig, clouds_of, view
 
 
 @pytest.fixture(scope="module")
@@ -33,15 +46,15 @@ def test_depth_is_seen_inside_and_outside_the_crop(depth_dataset):
     inside = clouds[2][CROP.contains(clouds[2])]
     assert len(inside) == len(make_recipe().make().points([live_frame(2)])) < len(clouds[2])
     colours = colours_of(clouds[2], CROP)
-    assert (colours == command.INSIDE).all(axis=1).sum() == len(inside)
+    assert (colours == INSIDE).all(axis=1).sum() == len(inside)
 
 
 def test_colours_are_the_points_own_where_they_have_some():
     points = np.array([[0.5, 0, 0.1, 1.0, 0.5, 0], [5, 5, 5, 1.0, 0.5, 0]], dtype=np.float32)
-    np.testing.assert_array_equal(colours_of(points, CROP), [(255, 127, 0), command.OUTSIDE])
+    np.testing.assert_array_equal(colours_of(points, CROP), [(255, 127, 0), OUTSIDE])
     points[0, 3:] = (200, 100, 0)
     np.testing.assert_array_equal(colours_of(points, CROP)[0], (200, 100, 0))
-    np.testing.assert_array_equal(colours_of(points[:, :3], CROP), [command.INSIDE, command.OUTSIDE])
+    np.testing.assert_array_equal(colours_of(points[:, :3], CROP), [INSIDE, OUTSIDE])
 
 
 def test_an_environment():
@@ -61,16 +74,92 @@ def test_a_picture_and_a_recording(depth_dataset, tmp_path, monkeypatch, capsys)
     assert recording.read_bytes().startswith(b"RRF")
 
 
-@pytest.mark.usefixtures("calibrated")
-def test_the_page_is_served_on_this_machine_only(depth_dataset):
-    pytest.importorskip("viser")
-    server = view(ViewConfig(source=depth_dataset.root, crop_low=CROP.low, crop_high=CROP.high, port=18080))
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+WINDOW = (1100, 700)
+PANEL = 340
+"""[pixels] The width of the page's right side, which holds its sliders and buttons."""
+
+
+def free_port() -> int:
+    with socket.socket() as opened:
+        opened.bind(("127.0.0.1", 0))
+        return opened.getsockname()[1]
+
+
+@contextmanager
+def browser(url: str, folder: Path) -> Iterator[Callable[[], np.ndarray]]:
+    """A headless browser on a page, WebGL included; what it yields takes a picture of the page, (H, W, 3) uint8."""
+    import websockets.sync.client  # viser needs it
+
+    assert BROWSER is not None
+    command = [
+        *(BROWSER, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+        *("--hide-scrollbars", "--no-first-run", "--disable-dev-shm-usage", f"--user-data-dir={folder}"),
+        *(f"--window-size={WINDOW[0]},{WINDOW[1]}", "--remote-debugging-port=0", url),
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        assert server.get_host() == "127.0.0.1"
-        with urllib.request.urlopen(f"http://127.0.0.1:{server.get_port()}") as page:
-            assert b"<html" in page.read().lower()
+        file = folder / "DevToolsActivePort"
+        wait_until(lambda: file.exists() and file.read_text().count("\n"), 120)
+        with urllib.request.urlopen(f"http://127.0.0.1:{file.read_text().split()[0]}/json/list") as opened:
+            (address,) = [each["webSocketDebuggerUrl"] for each in json.load(opened) if each["url"].startswith(url)]
+        with websockets.sync.client.connect(address, max_size=None) as devtools:
+
+            def picture() -> np.ndarray:
+                devtools.send(json.dumps({"id": 1, "method": "Page.captureScreenshot"}))
+                data = json.loads(devtools.recv(timeout=120))["result"]["data"]
+                return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+            yield picture
     finally:
-        server.stop()
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)  # its helpers, too
+        process.wait()
+
+
+def n_pixels(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
+    """Pixels of about a colour beside the panel; the page lights its points, so that shades differ a little."""
+    scene = picture[:, : -PANEL - 20].astype(int)
+    return int((np.abs(scene - colour).max(axis=-1) < 30).sum())
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no browser: chromium, chromium-browser or google-chrome")
+@pytest.mark.usefixtures("calibrated")
+def test_a_browser_shows_the_cloud(depth_dataset, tmp_path):
+    """Blue points inside the crop and grey ones outside it, on the page as it is served; sliders turn blue to grey."""
+    pytest.importorskip("viser")
+    config = ViewConfig(source=depth_dataset.root, crop_low=CROP.low, crop_high=CROP.high, port=free_port())
+    with closing(view(config)) as pages:
+        page = next(pages)
+        try:
+            with browser(f"http://127.0.0.1:{page.server.get_port()}", tmp_path / "user") as picture:
+                wait_until(lambda: min(n_pixels(picture(), colour) for colour in (INSIDE, OUTSIDE)) > 100, 120)
+                for slider in page._sliders[:3]:
+                    slider.value = slider.max  # the crop holds nothing
+                wait_until(lambda: n_pixels(picture(), INSIDE) == 0, 120)
+                assert n_pixels(picture(), OUTSIDE) > 100
+        finally:
+            page.server.stop()
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_the_page_is_served_on_this_machine_only(depth_dataset, tmp_path):
+    pytest.importorskip("viser")
+    file = tmp_path / "mine.yaml"
+    crop = {"crop_low": CROP.low, "crop_high": CROP.high}
+    with closing(view(ViewConfig(source=depth_dataset.root, port=free_port(), config=file, **crop))) as pages:
+        page = next(pages)
+        try:
+            assert page.server.get_host() == "127.0.0.1"
+            with urllib.request.urlopen(f"http://127.0.0.1:{page.server.get_port()}") as opened:
+                assert b"<html" in opened.read().lower()
+            page._sliders[2].value = 0.1  # the lowest z
+            page.write()
+        finally:
+            page.server.stop()
+    depth = yaml.safe_load(file.read_text())["policy"]["depth"]
+    np.testing.assert_allclose(depth["crop_low"], (*CROP.low[:2], 0.1), atol=0.005)
+    np.testing.assert_allclose(depth["crop_high"], CROP.high, atol=0.005)
 
 
 def test_the_crop_is_written_into_a_training_configuration(tmp_path):
@@ -93,14 +182,14 @@ def test_the_crop_is_written_into_a_training_configuration(tmp_path):
 def test_wrong_input(depth_dataset, tmp_path, monkeypatch):
     monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
     wrong = {
-        "Give either --source or --env.type": ViewConfig(),
+        "Give one of --source, --env.type and --camera.type": ViewConfig(),
         "Camera 'front' needs a calibration": ViewConfig(source=depth_dataset.root),
         "must be a LeRobot dataset": ViewConfig(source=tmp_path),
         "episode must be at least 0": ViewConfig(source=tmp_path, episode=-1),
     }
     for message, config in wrong.items():
         with pytest.raises(UserError, match=message):
-            view(config)
+            next(view(config))
 
 
 def test_without_a_crop_the_box_of_the_points_is_shown():

@@ -20,6 +20,7 @@ class EpisodeReport(NamedTuple):
     high: NDArray[np.float32]  # (3,) highest corner [m]
     state: NDArray[np.float32]  # (L, S)
     action: NDArray[np.float32]  # (L, A)
+    seen: str  # of the first frame with too few points, what part of the scene the crop covers
 
 
 def write_report(folder: Path, episodes: Sequence[EpisodeReport], least: int) -> None:

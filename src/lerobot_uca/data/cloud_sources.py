@@ -6,7 +6,7 @@ A source is light to send to another process and opens its files there. Letters:
 import csv
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_uca.data.recorded_calibrations import EXTRINSICS, INTRINSICS, recorded_calibrations
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import VALID_MASK_SUFFIX, find_point_cloud
 from lerobot_uca.point_clouds.depth import DepthError, is_valid
 from lerobot_uca.point_clouds.geometry import Crop
-from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe, camera_of, recipe_for
 
 ZARR_KEYS = ("data/point_cloud", "data/state", "data/action", "meta/episode_ends")
 ACTION, STATE = "action", "observation.state"
@@ -54,6 +55,15 @@ class Source(ABC):
     @abstractmethod
     def frames(self, episode: int) -> list[Frame]:
         """The steps of one episode."""
+
+    def seen(self, episode: int, frame: int) -> str:
+        """The part of the scene that the crop covers in one step, in a line."""
+        points = replace(self, crop=None).frames(episode)[frame].points[:, :3]  # type: ignore[type-var]
+        if len(points) == 0:
+            return "The cloud has no finite point"
+        low, high = (np.round(np.percentile(points, share, axis=0), 3).tolist() for share in (1, 99))
+        crop = f"the crop is {self.crop.low} to {self.crop.high} m" if self.crop else "there is no crop"
+        return f"The cloud has {len(points)} finite points from {low} to {high} m; {crop}"
 
     @property
     def fps(self) -> int | None:
@@ -140,9 +150,33 @@ class LeRobotSource(Source):
         """The names of a feature's numbers."""
         return self.features[key].get("names")
 
+    def make_clouds(self, corners: tuple[Any, Any] | None, n_points: int, folder: str | None) -> None:
+        """Make clouds from the depth images from now on.
+
+        Args:
+            corners: of the crop; None for that of a simulated camera.
+            n_points: of a cloud.
+            folder: of calibrations. Without one the dataset's own count, and then those of $LEROBOT_UCA_CALIBRATION.
+
+        Raises:
+            CalibrationError: if a calibration or the crop is missing.
+        """
+        recorded = {} if folder else recorded_calibrations(self._dataset)
+        self.depth_recipe = recipe_for(self.features, corners, n_points, folder, recorded)
+
+    def seen(self, episode: int, frame: int) -> str:
+        """The part of the scene that the crop covers in one step, in a line."""
+        if self.depth_recipe is None:
+            return super().seen(episode, frame)
+        item = self._dataset[self._dataset.meta.episodes[episode]["dataset_from_index"] + frame]
+        return self._make.seen([item[key].numpy() for key in self.depth_recipe.keys])
+
     def left_out(self) -> list[str]:
         """Features that are neither cloud, depth, state nor action."""
-        kept = {STATE, ACTION, self._cloud_key, self._rgb_key, *(self.depth_recipe.keys if self.depth_recipe else ())}
+        kept = {STATE, ACTION, self._cloud_key, self._rgb_key}
+        if self.depth_recipe is not None:
+            cameras = [camera_of(key) for key in self.depth_recipe.keys]
+            kept |= {*self.depth_recipe.keys, *(kind + each for kind in (INTRINSICS, EXTRINSICS) for each in cameras)}
         own = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
         return [key for key in self.features if key not in kept | own]
 

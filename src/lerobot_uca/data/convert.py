@@ -33,7 +33,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import MIN_SHARE
 from lerobot_uca.point_clouds.geometry import sample_farthest
-from lerobot_uca.point_clouds.recipe import RECIPE_INFO, depth_keys, make_crop, recipe_for
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, depth_keys, make_crop
 
 logger = logging.getLogger(__name__)
 
@@ -121,11 +121,11 @@ def make_source(config: ConvertConfig) -> Source:
         crop = make_crop(*corners) if corners else None
         source = find_source(config.source, crop, config.task, colour=config.colour)
         if isinstance(source, LeRobotSource):
-            features = source.features
-            if depth_keys(features) and config.colour:
+            has_depth = bool(depth_keys(source.features))
+            if has_depth and config.colour:
                 raise UserError("--colour=true needs points with colours: depth images have none.")
-            if depth_keys(features):
-                source.depth_recipe = recipe_for(features, corners, config.n_points, config.calibration)
+            if has_depth:
+                source.make_clouds(corners, config.n_points, config.calibration)
     except CalibrationError as error:
         raise UserError(str(error)) from error
     return source
@@ -134,6 +134,7 @@ def make_source(config: ConvertConfig) -> Source:
 def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
     """Read and sample one episode."""
     frames = source.frames(episode)
+    few = [index for index, frame in enumerate(frames) if frame.n_points < least_points(n_points)]
     clouds = [_sample(frame.points, n_points) for frame in frames]
     state, action = (np.stack([getattr(frame, name) for frame in frames]) for name in ("state", "action"))
     report = EpisodeReport(
@@ -144,8 +145,14 @@ def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
         high=np.max([cloud[:, :3].max(axis=0) for cloud in clouds], axis=0),
         state=state,
         action=action,
+        seen=source.seen(episode, few[0]) if few else "",
     )
     return Episode(np.stack(clouds), state, action, [frame.task for frame in frames], report)
+
+
+def least_points(n_points: int) -> int:
+    """A frame with fewer points inside the crop is too empty for a cloud of so many."""
+    return max(1, int(MIN_SHARE * n_points))
 
 
 def _sample(points: NDArray[np.float32], n_points: int) -> NDArray[np.float32]:
@@ -166,7 +173,7 @@ def _chosen(episodes: list[int] | None, n_episodes: int) -> list[int]:
 def _write(config: ConvertConfig, source: Source, fps: int, episodes: list[int], root: Path) -> None:
     dataset: LeRobotDataset | None = None
     reports: list[EpisodeReport] = []
-    least = max(1, int(MIN_SHARE * config.n_points))
+    least = least_points(config.n_points)
     try:
         for episode in _converted(config, source, episodes):
             reports.append(episode.report)
@@ -187,8 +194,8 @@ def _write(config: ConvertConfig, source: Source, fps: int, episodes: list[int],
         if len(few):
             raise UserError(
                 f"Episode {report.episode} has {len(few)} of {len(report.n_points)} frames with fewer than {least} "
-                f"points inside the crop, the first is frame {few[0]} with {report.n_points[few[0]]}. Widen the crop, "
-                "or leave the episode out with --episodes; --report=FOLDER shows all."
+                f"points inside the crop, the first is frame {few[0]} with {report.n_points[few[0]]}. {report.seen}. "
+                "Move the crop, or leave the episode out with --episodes; --report=FOLDER shows all."
             )
 
 

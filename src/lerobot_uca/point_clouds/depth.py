@@ -6,7 +6,7 @@ Letters: H, W height and width of an image, N points.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ NEAR, FAR = 0.01, 10.0
 CANDIDATES_PER_POINT = 8
 """Farthest point sampling chooses among this many pixels for each point. The cloud's largest gap is 15 to 45 %
 wider than if it chose among all, and making the cloud takes 1 to 4 ms instead of 20 to 130 (benchmarks/depth.py)."""
+UNITS = {"1 mm": 1e-3, "1 m": 1.0, "0.25 mm": 2.5e-4, "0.1 mm": 1e-4}
+"""Units [m] that cameras and drivers give depth in: RealSense D4xx and ROS, floating point numbers, L515, D405."""
 MIN_SHARE = 1 / 8
 """A cloud with fewer different points than this share of N is an error."""
 
@@ -102,12 +104,31 @@ class DepthToCloud:
             [selector.points(image, share) for selector, image in zip(self._selectors, images, strict=True)]
         )
 
+    def seen(self, images: Sequence[NDArray[Any]]) -> str:
+        """The part of the scene that the crop covers, camera by camera, and a unit of depth in which it has points."""
+        lines = [describe(view, image, self.crop) for view, image in zip(self.views, images, strict=True)]
+        return ". ".join([*lines, *self._other_unit(images)])
+
     def _too_few(self, n_points: int, images: Sequence[NDArray[Any]]) -> str:
-        seen = "; ".join(describe(view, image) for view, image in zip(self.views, images, strict=True))
         return (
             f"The cloud has {n_points} points inside the crop {self.crop.low} to {self.crop.high} m, "
-            f"at least {self.min_points} are needed. {seen}."
+            f"at least {self.min_points} are needed. {self.seen(images)}."
         )
+
+    def _other_unit(self, images: Sequence[NDArray[Any]]) -> list[str]:
+        """A line for a camera that would see the crop if its depth were in another unit; nothing if none would."""
+        lines = []
+        for view, image in zip(self.views, images, strict=True):
+            unit = view.unit or unit_of(image.dtype)
+            for name, other in UNITS.items():
+                n_points = len(_Selector(replace(view, unit=other), self.crop).points(image, None))
+                if other != unit and n_points >= self.min_points:
+                    lines.append(
+                        f"In units of {name} camera '{view.camera.name}' would have {n_points} points inside the crop: "
+                        f"check its depth_unit, which is {unit:g} m"
+                    )
+                    break
+        return lines
 
 
 class _Selector:
@@ -175,8 +196,8 @@ def is_valid(view: DepthView, image: NDArray[Any]) -> NDArray[np.bool_]:
     return (depth > view.near) & (depth < view.far)
 
 
-def describe(view: DepthView, image: NDArray[Any]) -> str:
-    """A depth image in a line: its valid share and the box of its points, or a unit that would fit."""
+def describe(view: DepthView, image: NDArray[Any], crop: Crop) -> str:
+    """A depth image in a line: its valid share, the box of its points, and the share within a crop along each axis."""
     camera, unit = view.camera, view.unit or unit_of(image.dtype)
     depth = as_image(camera, image).astype(np.float64)
     valid = is_valid(view, image)
@@ -185,16 +206,18 @@ def describe(view: DepthView, image: NDArray[Any]) -> str:
         if len(measured) == 0:
             return f"Camera '{camera.name}' measures nothing: every pixel is 0 or NaN"
         median = float(np.median(measured))
-        units = {"millimetres": 1e-3, "metres": 1.0}
-        fits = [name for name, metres in units.items() if metres != unit and 0.1 < median * metres < view.far]
-        hint = f", and would fit {fits[0]}" if fits else ""
         return (
             f"Camera '{camera.name}' measures nothing between {view.near} and {view.far} m: its median is {median:g} "
-            f"units of {unit:g} m{hint}"
+            f"units of {unit:g} m"
         )
     points = camera.unproject(np.where(valid, depth * unit, 0))[valid.ravel()]
     low, high = (np.round(np.percentile(points, share, axis=0), 3).tolist() for share in (1, 99))
-    return f"Camera '{camera.name}' has {valid.mean():.0%} valid depth and sees {low} to {high} m"
+    covered = np.mean((points >= crop.low) & (points <= crop.high), axis=0)
+    shares = ", ".join(f"{axis} of {share:.0%}" for axis, share in zip("xyz", covered, strict=True))
+    return (
+        f"Camera '{camera.name}' has {valid.mean():.0%} valid depth and sees {low} to {high} m; of its points the crop "
+        f"holds the {shares}"
+    )
 
 
 def to_millimetres(depth: NDArray[np.floating[Any]]) -> NDArray[np.uint16]:

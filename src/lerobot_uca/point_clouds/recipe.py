@@ -205,16 +205,22 @@ def depth_keys(features: Features) -> list[str]:
     ]
 
 
-def recipe_for(features: Features, crop: tuple[Any, Any] | None, n_points: int, folder: str | None) -> CloudRecipe:
+def recipe_for(
+    features: Features,
+    crop: tuple[Any, Any] | None,
+    n_points: int,
+    folder: str | None,
+    recorded: Mapping[str, Calibration] | None = None,
+) -> CloudRecipe:
     """The recipe for all depth images of a dataset.
 
-    Calibrations are those of a folder or of $LEROBOT_UCA_CALIBRATION. A simulated camera comes with a recipe, in which
-    its calibration and a crop are.
+    Calibrations are those of a folder or of $LEROBOT_UCA_CALIBRATION, but for cameras whose calibrations are recorded
+    in the dataset. A simulated camera comes with a recipe, in which its calibration and a crop are.
 
     Raises:
         CalibrationError: if a calibration or the crop is missing.
     """
-    installed = installed_calibrations(folder)
+    installed = {**(installed_calibrations(folder) or {}), **(recorded or {})}
     sources = []
     for key in depth_keys(features):
         info = features[key].get("info") or {}

@@ -29,8 +29,7 @@ class DepthConfig:
     crop_high: tuple[float, float, float] | None = None
     # Points of the cloud. policy.n_points may look at fewer of them.
     n_points: int = within(512, least=1, most=100_000)
-    # Folder of the cameras' calibrations, for training; by default $LEROBOT_UCA_CALIBRATION, which also holds on the
-    # robot.
+    # Folder of the cameras' calibrations, in training and on the robot; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
     # The recipe of training's clouds; written by training, not for users.
     recipe: dict[str, Any] | None = None

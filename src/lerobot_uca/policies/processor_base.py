@@ -83,6 +83,8 @@ def load_processors(
     before = {key: dict(each) for key, each in (options.pop("preprocessor_overrides", None) or {}).items()}
     after = {key: dict(each) for key, each in (options.pop("postprocessor_overrides", None) or {}).items()}
     before.setdefault("device_processor", {"device": config.device})  # the saved one may be another machine's
+    if config.depth.calibration is not None and config.depth.recipe is not None:
+        before["depth_to_cloud_processor"] = {"calibration": config.depth.calibration}
     if "stats" in before.get("normalizer_processor", {}):
         rename_map = before.get("rename_observations_processor", {}).get("rename_map")
         stats = settled_statistics(before["normalizer_processor"]["stats"], config, rename_map)

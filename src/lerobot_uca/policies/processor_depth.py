@@ -31,22 +31,24 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
     Depth images (1, H, W) or with further dimensions before, such as (B, 1, H, W) of a live uint16 frame and
     (B, O, 1, H, W) of a batch from a dataset, become clouds (N, 3), (B, N, 3) or (B, O, N, 3) float32 [m].
 
-    The cameras are where $LEROBOT_UCA_CALIBRATION says they are and otherwise where they were in training; the step
-    says how far that is apart.
+    The cameras are where this installation's calibrations say they are and otherwise where they were in training; the
+    step says how far that is apart.
 
     Args:
         recipe: how clouds were made in training, a `CloudRecipe` as a dictionary; None if the policy was trained on
             clouds of unknown origin. Then the step does nothing.
+        calibration: folder of this installation's calibrations; by default $LEROBOT_UCA_CALIBRATION. Not saved.
     """
 
     recipe: dict[str, Any] | None = None
+    calibration: str | None = None
     _present: CloudRecipe | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.recipe is None:
             return
         try:
-            self._present = _installed(CloudRecipe.from_dict(self.recipe))
+            self._present = _installed(CloudRecipe.from_dict(self.recipe), self.calibration)
             self._make = self._present.make()
         except CalibrationError as error:
             raise UserError(str(error)) from error
@@ -93,9 +95,9 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
         return {**features, PipelineFeatureType.OBSERVATION: {**rest, OBS_POINT_CLOUD: cloud}}
 
 
-def _installed(trained: CloudRecipe) -> CloudRecipe:
+def _installed(trained: CloudRecipe, folder: str | None) -> CloudRecipe:
     """The recipe with this installation's calibrations, if it has some, and a line about what differs."""
-    calibrations = installed_calibrations()
+    calibrations = installed_calibrations(folder)
     if calibrations is not None:
         present = trained.with_calibrations(calibrations)
         differences = trained.differences(present)

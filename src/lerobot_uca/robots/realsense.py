@@ -1,0 +1,48 @@
+"""Connecting cameras, with a line about a RealSense camera that librealsense no longer knows."""
+
+import importlib.metadata
+from pathlib import Path
+from typing import Any
+
+from lerobot_uca.errors import UserError
+
+USB_DEVICES = Path("/sys/bus/usb/devices")
+INTEL = "8086"
+L515_PRODUCTS = ("0b0d", "0b3d", "0b64")
+"""USB product numbers of the L500 family, of which the L515 was sold."""
+DROPPED_BY = "2.55.1"
+"""The first release of librealsense without the L500 family, and the one that LeRobot needs."""
+
+
+def connect(name: str, camera: Any) -> None:
+    """Connect a LeRobot camera.
+
+    Raises:
+        UserError: if it fails, and an L515 is plugged in, which the installed librealsense does not know.
+    """
+    try:
+        camera.connect()
+    except (OSError, RuntimeError, ValueError) as error:
+        hint = dropped_camera(USB_DEVICES)
+        if hint is None:
+            raise
+        raise UserError(f"Camera '{name}' cannot be opened. {hint}") from error
+
+
+def dropped_camera(devices: Path) -> str | None:
+    """A line about an L515 among the USB devices that Linux lists in a folder; None if there is none."""
+    for product in devices.glob("*/idProduct"):
+        vendor = product.with_name("idVendor")
+        if product.read_text().strip() in L515_PRODUCTS and vendor.read_text().strip() == INTEL:
+            return (
+                f"An L515 is plugged in: librealsense {DROPPED_BY} and newer dropped it, installed is {_installed()}. "
+                "Use a D435 or D455; for the L515 build librealsense 2.54 from source."
+            )
+    return None
+
+
+def _installed() -> str:
+    try:
+        return importlib.metadata.version("pyrealsense2")
+    except importlib.metadata.PackageNotFoundError:
+        return "none"
