@@ -172,7 +172,10 @@ def resume(checkpoint, monkeypatch):
 
 
 def step(**changes):
-    return DepthToCloudProcessorStep(make_recipe(**changes).as_dict())
+    """A step as it is when its checkpoint has been loaded."""
+    made = DepthToCloudProcessorStep(make_recipe(**changes).as_dict())
+    made.install()
+    return made
 
 
 def pure_cloud(index, recipe=None):
@@ -226,7 +229,7 @@ def test_a_recipe_survives_being_written():
 @pytest.mark.parametrize("recipe", [{}, {"sources": 3, "crop": [], "n_points": 1}, {"sources": [{}]}])
 def test_a_damaged_recipe_is_refused(recipe):
     with pytest.raises(UserError, match="A recipe needs sources, crop and n_points"):
-        DepthToCloudProcessorStep(recipe)
+        DepthToCloudProcessorStep(recipe).install()
 
 
 def moved_camera(mm):

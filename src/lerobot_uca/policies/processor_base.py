@@ -83,8 +83,6 @@ def load_processors(
     before = {key: dict(each) for key, each in (options.pop("preprocessor_overrides", None) or {}).items()}
     after = {key: dict(each) for key, each in (options.pop("postprocessor_overrides", None) or {}).items()}
     before.setdefault("device_processor", {"device": config.device})  # the saved one may be another machine's
-    if config.depth.calibration is not None and config.depth.recipe is not None:
-        before["depth_to_cloud_processor"] = {"calibration": config.depth.calibration}
     if "stats" in before.get("normalizer_processor", {}):
         rename_map = before.get("rename_observations_processor", {}).get("rename_map")
         stats = settled_statistics(before["normalizer_processor"]["stats"], config, rename_map)
@@ -92,6 +90,9 @@ def load_processors(
         after.setdefault("unnormalizer_processor", {})["stats"] = stats
     overrides = {"preprocessor_overrides": before, "postprocessor_overrides": after}
     processors = make(config, checkpoint, *args, **options, **overrides)
+    for step in processors[0].steps:
+        if isinstance(step, DepthToCloudProcessorStep):
+            step.install(config.depth.calibration)
     _check_pipelines(config, checkpoint, *processors)
     return processors
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.calibration import CalibrationError
-from lerobot_uca.point_clouds.depth import DepthError
+from lerobot_uca.point_clouds.depth import DepthError, DepthToCloud
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, SIMULATED, CloudRecipe, installed_calibrations
 
 logger = logging.getLogger(__name__)
@@ -37,27 +37,37 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
     Args:
         recipe: how clouds were made in training, a `CloudRecipe` as a dictionary; None if the policy was trained on
             clouds of unknown origin. Then the step does nothing.
-        calibration: folder of this installation's calibrations; by default $LEROBOT_UCA_CALIBRATION. Not saved.
     """
 
     recipe: dict[str, Any] | None = None
-    calibration: str | None = None
     _present: CloudRecipe | None = field(default=None, init=False, repr=False, compare=False)
+    _make: DepthToCloud | None = field(default=None, init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
+    def install(self, folder: str | None = None) -> None:
+        """Take this installation's calibrations; at the first depth image at the latest.
+
+        Args:
+            folder: of calibrations; by default $LEROBOT_UCA_CALIBRATION.
+
+        Raises:
+            UserError: if a camera is not calibrated, or if something cannot be right.
+        """
         if self.recipe is None:
             return
         try:
-            self._present = _installed(CloudRecipe.from_dict(self.recipe), self.calibration)
+            self._present = _installed(CloudRecipe.from_dict(self.recipe), folder)
             self._make = self._present.make()
         except CalibrationError as error:
             raise UserError(str(error)) from error
 
     @override
     def observation(self, observation: RobotObservation) -> RobotObservation:
-        recipe = self._present
-        if recipe is None or OBS_POINT_CLOUD in observation:
+        if self.recipe is None or OBS_POINT_CLOUD in observation:
             return observation
+        if self._present is None:
+            self.install()
+        recipe = self._present
+        assert recipe is not None
         missing = [key for key in recipe.keys if key not in observation]
         if missing:
             raise UserError(
@@ -73,6 +83,7 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
         leading = arrays[0].shape[:-3]
         frames = [array.reshape(-1, *array.shape[-3:]) for array in arrays]
         try:
+            assert self._make is not None
             clouds = [self._make(views) for views in zip(*frames, strict=True)]
         except DepthError as error:
             raise UserError(str(error)) from error
@@ -86,10 +97,10 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        recipe = self._present
         observations = features[PipelineFeatureType.OBSERVATION]
-        if recipe is None or OBS_POINT_CLOUD in observations:
+        if self.recipe is None or OBS_POINT_CLOUD in observations:
             return features
+        recipe = CloudRecipe.from_dict(self.recipe)
         rest = {key: feature for key, feature in observations.items() if key not in recipe.keys}
         cloud = PolicyFeature(FeatureType.STATE, (recipe.n_points, 3))
         return {**features, PipelineFeatureType.OBSERVATION: {**rest, OBS_POINT_CLOUD: cloud}}
