@@ -35,12 +35,16 @@ def benchmark(output: Path, *options: str) -> subprocess.CompletedProcess[str]:
 
 
 def make_run(output: Path, **changes: object) -> RunFolder:
-    """A folder that has its demonstrations; collecting them has tests of its own."""
+    """A folder with a setting, and without demonstrations."""
     values = {**TINY, **changes}
     folder = RunFolder.create(output, Setting.from_values("tiny", values))
+    (output / "tiny.yaml").write_text(yaml.safe_dump(values))
+    return folder
+
+
+def with_demonstrations(folder: RunFolder) -> RunFolder:
     with folder.demonstrations(GOOD) as dataset:
         write_dataset(dataset)
-    (output / "tiny.yaml").write_text(yaml.safe_dump(values))
     return folder
 
 
@@ -75,7 +79,9 @@ def test_there_is_a_row_for_each_episode(finished):
     ]
     assert [(row.step, row.is_final, row.episode_seed) for row in rows] == expected
     assert all(row.length == 200 or row.success for row in rows)
-    assert {row.epoch for row in rows} == {round(step * 4 / 39, 2) for step in (2, 4)}  # of 39 frames
+    dataset = folder.path / "demonstrations" / GOOD.task
+    n_frames = json.loads((dataset / "meta" / "info.json").read_text())["total_frames"]
+    assert {row.epoch for row in rows} == {round(step * 4 / n_frames, 2) for step in (2, 4)}
 
 
 def test_a_result_says_how_it_was_made(finished):
@@ -135,7 +141,7 @@ def wait_for(condition) -> None:
 
 
 def test_a_run_that_is_killed_goes_on_inside_the_training(tmp_path):
-    folder = make_run(tmp_path, lengths={"metaworld": {"steps": 300, "evaluations": 3}})
+    folder = with_demonstrations(make_run(tmp_path, lengths={"metaworld": {"steps": 300, "evaluations": 3}}))
     files = folder.cell(GOOD)
     killed = start(folder, "--seeds=0")
     checkpoints = files.training / "checkpoints"
