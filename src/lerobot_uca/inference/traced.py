@@ -128,28 +128,24 @@ class _Weights:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        found = [
-            (module._parameters, name, weight)
-            for module in network.modules()
-            for name, weight in module._parameters.items()
-            if weight is not None
-        ]
-        self._owners, self._names, weights = map(list, zip(*found, strict=True)) if found else ([], [], [])
+        self._owners = [module._parameters for module in network.modules() if module._parameters]
+        weights = self._weights()
         # Weights made in inference mode count no changes: nothing trains them.
         self._counts_changes = [not weight.is_inference() for weight in weights]
-        self._seen = self._look(weights)
+        self._addresses = list(map(Tensor.data_ptr, weights))
+        self._changes = self._count_changes(weights)
         self._kept = [weight.detach() for weight in weights]  # while a storage is kept, no other one has its address
 
     def have_changed(self) -> bool:
-        """Whether any weight is not what it was."""
-        try:
-            return self._look(list(map(dict.get, self._owners, self._names))) != self._seen  # type: ignore[arg-type]
-        except TypeError:  # None has no address: a weight is gone
-            return True
+        """Whether any weight is not what it was. (`map` takes a third of a loop's time.)"""
+        weights = self._weights()
+        return list(map(Tensor.data_ptr, weights)) != self._addresses or self._count_changes(weights) != self._changes
 
-    def _look(self, weights: list[nn.Parameter]) -> tuple[list[int], list[int]]:
-        """Addresses and numbers of changes. `map` takes a third of a loop's time."""
-        return list(map(Tensor.data_ptr, weights)), list(map(VERSION, compress(weights, self._counts_changes)))
+    def _weights(self) -> list[nn.Parameter]:
+        return [weight for owner in self._owners for weight in owner.values() if weight is not None]
+
+    def _count_changes(self, weights: list[nn.Parameter]) -> list[int]:
+        return list(map(VERSION, compress(weights, self._counts_changes)))
 
 
 def to_onnx(
