@@ -1,6 +1,7 @@
 """Training, fine-tuning and loading: the right statistics reach LeRobot's normalisers, or a line says why not."""
 
 import json
+import runpy
 import shutil
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
 from lerobot_uca.data.batched_dataset import BatchedDataset
-from lerobot_uca.deploy.export import RawPolicy
+from lerobot_uca.deploy.export import RawPolicy, export
+from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
@@ -161,6 +163,20 @@ def test_clouds_of_other_plugins_train_and_act(tmp_path, cloud, channels):
     frame = LeRobotDataset("test/random", root=tmp_path / "data")[0]
     assert post(policy.select_action(pre(frame))).shape == (1, N_ACTIONS)
     assert RawPolicy(str(trained)).input_shapes["point_cloud"] == (2, N_POINTS, 3)
+    check_exported(trained, frame, cloud)
+
+
+def check_exported(trained: Path, frame: dict, cloud: str) -> None:
+    """The exported file gives a raw frame's actions as the policy does."""
+    policy, pre, post = load(trained)
+    export(str(trained), trained / "policy.onnx")
+    runner = OnnxPolicy(trained / "policy.onnx")
+    noise = torch.randn(1, policy.config.horizon, N_ACTIONS)
+    expected = post(policy.predict_action_chunk(pre(frame), noise=noise))[0]
+    xyz = frame[cloud].numpy()[..., :3]
+    actions = runner.plan(np.stack([xyz] * 2), np.stack([frame[STATE].numpy()] * 2), noise[0].numpy())
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+    assert runner.select_action(frame[cloud].numpy(), frame[STATE].numpy()).shape == (N_ACTIONS,)
 
 
 @pytest.mark.parametrize("n_points", [None, 16])
@@ -210,6 +226,30 @@ def test_invalid_points_count_nowhere(tmp_path):
     assert policy.select_action(pre(LeRobotDataset("test/random", root=tmp_path / "data")[0])).isfinite().all()
 
 
+def test_a_frame_without_valid_points_is_named(tmp_path):
+    def mask(frame, episode, index):
+        frame["observation.pointcloud.valid_mask"][:] = (episode, index) != (1, 2)
+
+    of_mask = {"dtype": "bool", "shape": (N_POINTS,), "names": None}
+    both = {**features("observation.pointcloud.xyz"), "observation.pointcloud.valid_mask": of_mask}
+    write_dataset(tmp_path / "data", features=both, change=mask)
+    with pytest.raises(UserError, match=r"got none in episode 1, frame 2\. --dataset\.episodes=\[0,2\] leaves"):
+        train(tmp_path / "data", tmp_path / "new")
+
+
+def test_evaluation_under_another_name(checkpoint):
+    """As `lerobot-eval --rename_map` loads the processors."""
+    policy, pre, _ = load(checkpoint)
+    renaming = {"rename_observations_processor": {"rename_map": {"observation.scan": OBS_POINT_CLOUD}}}
+    renamed, _ = make_pre_post_processors(
+        policy.config, pretrained_path=str(checkpoint), preprocessor_overrides=renaming
+    )
+    cloud, state = torch.randn(1, N_POINTS, 3), torch.randn(1, N_STATES)
+    expected = pre({OBS_POINT_CLOUD: cloud, STATE: state})
+    assert not torch.equal(expected[OBS_POINT_CLOUD], cloud)  # it is normalised
+    assert torch.equal(renamed({"observation.scan": cloud, STATE: state})[OBS_POINT_CLOUD], expected[OBS_POINT_CLOUD])
+
+
 def test_fine_tuning_under_other_names_and_with_more_points(checkpoint, tmp_path):
     write_dataset(tmp_path / "data", features=features("observation.scan", n_points=64))
     rename = {"observation.scan": OBS_POINT_CLOUD}
@@ -217,6 +257,9 @@ def test_fine_tuning_under_other_names_and_with_more_points(checkpoint, tmp_path
     scan = columns(tmp_path / "data", "observation.scan")
     np.testing.assert_allclose(saved(trained)[f"{OBS_POINT_CLOUD}.max"], scan.max(axis=(0, 1)), rtol=1e-6)
     assert RawPolicy(str(trained)).input_shapes["point_cloud"] == (2, 64, 3)
+    frame = LeRobotDataset("test/random", root=tmp_path / "data")[0]
+    frame[OBS_POINT_CLOUD] = frame.pop("observation.scan")
+    check_exported(trained, frame, OBS_POINT_CLOUD)
 
 
 def test_fine_tuning_without_the_cloud_the_checkpoint_knows(checkpoint, tmp_path):
@@ -280,6 +323,17 @@ def test_a_checkpoint_of_a_machine_with_a_gpu_falls_back(damaged, caplog):
         == available
     )
     assert torch.cuda.is_available() or "Device 'cuda' is not available" in caplog.text
+
+
+def test_the_example_runs_a_checkpoint_of_a_machine_with_a_gpu(damaged, tmp_path, monkeypatch):
+    for name in ("config.json", "policy_preprocessor.json"):
+        file = damaged / name
+        file.write_text(file.read_text().replace('"cpu"', '"cuda"'))
+    example = Path(__file__).parent.parent / "examples" / "draw_prediction.py"
+    options = {"checkpoint": damaged, "task": "drawer-close", "output": tmp_path / "picture.png", "every": 1}
+    monkeypatch.setattr("sys.argv", [str(example), *(f"--{name}={value}" for name, value in options.items())])
+    runpy.run_path(str(example), run_name="__main__")
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("step", ["normalizer_processor", "device_processor"])

@@ -44,7 +44,8 @@ def chosen_statistics(dataset: Any, masks: Masks) -> Statistics:
 def check_finite(dataset: Any, masks: Masks) -> None:
     """Raise a `UserError` that names episode and frame if a value of the chosen episodes is NaN or infinite.
 
-    If the dataset is not read in batches, only the statistics are checked; they name the episode alone.
+    A cloud without valid points is refused, too. If the dataset is not read in batches, only the statistics are
+    checked, which name the episode alone.
     """
     columns = _columns(dataset)
     if columns is None:
@@ -56,6 +57,11 @@ def check_finite(dataset: Any, masks: Masks) -> None:
     for key, mask in masks.items():
         values = columns.tensors[key]
         valid = torch.ones(len(values), 1) if mask is None else columns.tensors[mask]
+        empty = (~valid.bool().any(dim=1)).nonzero().flatten()
+        if len(empty):
+            raise UserError(
+                f"'{mask}' must call some points of '{key}' valid, got none in " + _place(columns, empty, dataset)
+            )
         chunks = zip(values.split(1024), valid.split(1024), strict=True)
         rows = torch.cat([_bad(*chunk).any(dim=1) for chunk in chunks]).nonzero().flatten()
         if len(rows):

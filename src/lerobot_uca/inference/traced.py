@@ -137,8 +137,8 @@ class _Weights:
         self._kept = [weight.detach() for weight in weights]  # while a storage is kept, no other one has its address
 
     def have_changed(self) -> bool:
-        """Whether any weight is not what it was. (`map` takes a third of a loop's time.)"""
-        weights = self._weights()
+        """Whether any weight is not what it was."""
+        weights = self._weights()  # below, `map` takes a third of a loop's time
         return list(map(Tensor.data_ptr, weights)) != self._addresses or self._count_changes(weights) != self._changes
 
     def _weights(self) -> list[nn.Parameter]:
