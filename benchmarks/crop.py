@@ -45,7 +45,7 @@ def worst_shares(task: str, n_seeds: int) -> tuple[float, float]:
     env = MetaworldPointCloudEnv(task)
     low = np.array(env.crop.low) - [0, 0, TABLE_SLACK]
     around_origins = Crop(tuple(low), env.crop.high)
-    caster = RayCaster(CLOUD_CAMERA.position, CLOUD_CAMERA.ray_directions(), with_normals=False)
+    caster = RayCaster(CLOUD_CAMERA)
     positions, points = [], []
     for seed in range(n_seeds):
         env.reset(seed=seed)
@@ -55,7 +55,7 @@ def worst_shares(task: str, n_seeds: int) -> tuple[float, float]:
         hits = caster.cast(simulator.model, simulator.data)
         movable = is_movable(simulator.model)[simulator.model.geom_bodyid[hits.geom]] & (hits.geom >= 0)
         if movable.any():
-            seen = caster.origin + caster.directions[movable] * hits.distance[movable, None]
+            seen = caster.rays.origin + caster.rays.directions[movable] * hits.distance[movable, None]
             points.append(env.crop.contains(seen).mean())
     return min(positions), min(points, default=1.0)
 

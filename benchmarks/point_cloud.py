@@ -1,23 +1,29 @@
-"""Milliseconds of an environment's step, of the stages of its observation, and of the picture: medians of an episode.
+"""Milliseconds of the stages of an observation, before and after, of a step and of a picture: medians of an episode.
+
+all rays: MuJoCo's mj_multiRay at everything, as it was at first. near rays: what is fixed once, mj_multiRay along rays
+that pass near something that moves, in one thread, as it was then. rays, crop, sample: the observation's stages today.
 
 python benchmarks/point_cloud.py --expert='../shared/adroit_experts/{task}.npz'
 """
 
 import argparse
 
+import mujoco
 import numpy as np
 from common import print_provenance, timed
 from lerobot.envs import make_env_config
 
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Expert
-from lerobot_uca.point_clouds.geometry import sample_farthest
+from lerobot_uca.point_clouds import single_rays
+from lerobot_uca.point_clouds.geometry import Array, sample_farthest
+from lerobot_uca.point_clouds.rays import Rays
 
 TASKS = {
     "metaworld_pointcloud": ("drawer-close", "dial-turn", "shelf-place", "hand-insert", "hammer"),
     "adroit_pointcloud": ("hammer", "door", "pen", "relocate"),
 }
-STAGES = ("step", "rays + crop", "sample", "observation", "picture", "fewest points")
+STAGES = ("all rays", "near rays", "rays", "crop", "sample", "observation", "step", "picture", "fewest points")
 
 
 def main() -> None:
@@ -27,14 +33,14 @@ def main() -> None:
     parser.add_argument("--expert", help="who acts in Adroit, as for lerobot-uca-collect; random actions by default")
     args = parser.parse_args()
     print_provenance()
-    print(f"{'ms, median':34}" + "".join(f"{name:>14}" for name in STAGES))
+    print(f"{'ms, median':36}" + "".join(f"{name:>14}" for name in STAGES))
     for kind, tasks in TASKS.items():
         for task in tasks:
             config = make_env_config(kind, task=task)
             rows = measure(config, task, expert_of(config, task, args.expert), args.steps)
             times, n_points = np.median(rows[:, :-1], axis=0), rows[:, -1].min()
             name = f"{kind.removesuffix('_pointcloud')} {task}, {config.n_points} points"
-            print(f"{name:34}" + "".join(f"{value:14.2f}" for value in times) + f"{n_points:14.0f}")
+            print(f"{name:36}" + "".join(f"{value:14.2f}" for value in times) + f"{n_points:14.0f}")
 
 
 def expert_of(config: PointCloudEnvConfig, task: str, adroits: str | None) -> Expert:
@@ -45,20 +51,49 @@ def expert_of(config: PointCloudEnvConfig, task: str, adroits: str | None) -> Ex
 
 
 def measure(config: PointCloudEnvConfig, task: str, expert: Expert, n_steps: int) -> np.ndarray:
-    """Times [ms] of the stages and the number of points inside the crop, (steps, 6)."""
+    """Times [ms] of the stages and the number of points inside the crop, (steps, 9)."""
     env = config.env_factory(task)()
     env.action_space.seed(0)
     env.reset(seed=0)
+    camera = env.observer.camera
+    before = MultiRay(camera._caster.rays)
     rows = []
     for _ in range(n_steps):
         step, _ = timed(env.step, expert(env))
-        simulator = env._simulator
-        rays, points = timed(env.observer.camera.capture, simulator.model, simulator.data, env._markers())
+        scene = env._simulator.model, env._simulator.data
+        all_rays, _ = timed(before.cast, *scene)
+        near_rays, _ = timed(before.cast_near, *scene)
+        rays, _ = timed(camera._caster.cast, *scene)
+        captured, points = timed(camera.capture, *scene, env._markers())
         sample, _ = timed(sample_farthest, points, env.n_points)
         observe, _ = timed(env.observe)
         picture, _ = timed(env.render)
-        rows.append([step, rays, sample, observe, picture, len(points)])
+        rows.append([all_rays, near_rays, rays, captured - rays, sample, observe, step, picture, len(points)])
     return np.array(rows)
+
+
+class MultiRay:
+    """MuJoCo's own way to cast many rays."""
+
+    def __init__(self, rays: Rays) -> None:
+        self.rays = rays
+
+    def cast(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """All rays at everything."""
+        self._cast(self.rays.directions, model, data, at_fixed=True)
+
+    def cast_near(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """The rays near something that moves at what moves."""
+        geoms = single_rays.visible(model)
+        moving = geoms[model.body_weldid[model.geom_bodyid[geoms]] != 0]
+        near = single_rays.near(moving, model, data, self.rays)
+        self._cast(self.rays.directions[near], model, data, at_fixed=False)
+
+    def _cast(self, directions: Array, model: mujoco.MjModel, data: mujoco.MjData, *, at_fixed: bool) -> None:
+        n_rays = len(directions)
+        geom, distance = np.empty(n_rays, np.int32), np.empty(n_rays)
+        scene = (model, data, self.rays.origin, directions.ravel(), single_rays.VISIBLE_GROUPS, at_fixed, -1)
+        mujoco.mj_multiRay(*scene, geom, distance, None, n_rays, mujoco.mjMAXVAL)
 
 
 if __name__ == "__main__":

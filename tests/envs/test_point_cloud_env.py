@@ -7,6 +7,9 @@ from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds import single_rays
+from lerobot_uca.point_clouds.geometry import ray_sphere_distances, sample_farthest
+from lerobot_uca.point_clouds.rays import Hits, Rays
 
 
 @pytest.mark.parametrize(
@@ -141,3 +144,29 @@ def test_depth_is_of_one_camera_and_one_crop():
     with pytest.raises(UserError, match=r"env\.observation must be one of point_cloud, depth, got 'colour'"):
         make_env_config("metaworld_pointcloud", task="reach", observation="colour").validate()
     assert make_env_config("metaworld_pointcloud", task="drawer-close,reach").recipe() is not None
+
+
+@pytest.mark.parametrize(
+    ("kind", "task"),
+    [
+        *(("metaworld_pointcloud", task) for task in ("assembly", "coffee-pull", "door-open", "hand-insert", "push")),
+        *(("adroit_pointcloud", task) for task in ("hammer", "door", "pen", "relocate")),
+    ],
+)
+def test_the_cloud_is_that_of_casting_all_rays_at_everything(kind, task):
+    env = make_env_config(kind, task=task).env_factory(task)()
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    camera, crop = env.observer.camera.camera, env.crop
+    rays = Rays.of(camera, np.ones(camera.width * camera.height, bool))
+    for _ in range(2):
+        for _ in range(15):
+            env.act(env.action_space.sample())
+        model, data = env._simulator.model, env._simulator.data
+        hits = Hits.none(len(rays.directions), with_normals=False)
+        single_rays.cast_at(single_rays.visible(model), model, data, rays, hits)
+        distances = [ray_sphere_distances(rays.origin, rays.directions, *marker[:2]) for marker in env._markers()]
+        distance = np.minimum.reduce([hits.distance, *distances])[:, None]
+        points = (rays.origin + rays.directions * distance)[np.isfinite(distance[:, 0])]
+        expected = sample_farthest(points[crop.contains(points)], env.n_points)
+        np.testing.assert_array_equal(env.observe()["point_cloud"], expected)

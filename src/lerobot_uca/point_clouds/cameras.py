@@ -1,7 +1,7 @@
 """Cameras that see a MuJoCo scene by ray casting.
 
 Like MuJoCo's own renderer they see the geoms of the visible groups and the task's markers (goal sites, which are not
-geoms and which `mj_multiRay` therefore passes through).
+geoms and which rays therefore pass through).
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, ray_sphere_di
 from lerobot_uca.point_clouds.ray_casting import RayCaster
 
 ROUNDING = 1e-9  # [m], far above that of a distance and far below what a camera resolves
+MIN_LENGTH = 1e-30  # [m]; a ray without a hit has a normal of length 0
 BACKGROUND = np.array([235, 238, 242], dtype=np.uint8)
 DEFAULT_GEOM_COLOUR = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 
@@ -41,15 +42,15 @@ class PointCloudCamera:
         self.camera, self.crop = camera, crop
         enter, leave = crop.span(origin, directions)
         meets = enter <= leave
-        self._caster = RayCaster(origin, directions[meets], with_normals=False)
+        self._caster = RayCaster(camera, meets)
         self._enter, self._leave = enter[meets] - ROUNDING, leave[meets] + ROUNDING
 
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
         """Visible points inside the crop, (N, 3), world frame [m]. `data` must be up to date (`mj_forward`)."""
-        caster = self._caster
-        distance = _distances(caster, model, data, markers)
-        near = (distance >= self._enter) & (distance <= self._leave)
-        points = caster.origin + caster.directions[near] * distance[near, None]
+        rays = self._caster.rays
+        distance = _distances(self._caster, model, data, markers)
+        near = np.flatnonzero((distance >= self._enter) & (distance <= self._leave))
+        points = rays.origin + rays.directions[near] * distance[near, None]
         return points[self.crop.contains(points)]
 
 
@@ -58,7 +59,7 @@ class DepthCamera:
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self._caster = RayCaster(camera.position, camera.ray_directions(), with_normals=False)
+        self._caster = RayCaster(camera)
 
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
         """Depths (H, W) [m], inf where nothing is. `to_millimetres` makes of them what a RealSense camera gives."""
@@ -70,21 +71,25 @@ class PictureCamera:
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self._caster = RayCaster(camera.position, camera.ray_directions(), with_normals=True)
+        self._caster = RayCaster(camera, with_normals=True)
+        self._model: mujoco.MjModel | None = None
 
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> NDArray[np.uint8]:
         """The picture, (H, W, 3) uint8."""
-        caster = self._caster
-        distance, geom, normal = caster.cast(model, data)
-        colour = surface_colours(model)[geom]
+        rays = self._caster.rays
+        distance, geom, normal = self._caster.cast(model, data)
+        if model is not self._model:
+            self._model, self._colours = model, surface_colours(model)
+        colour = self._colours[geom]
         for marker in markers:
-            to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)
+            to_marker = ray_sphere_distances(rays.origin, rays.directions, marker.centre, marker.radius)
             nearer = to_marker < distance
-            surface = caster.origin + caster.directions[nearer] * to_marker[nearer, None]
-            normal[nearer] = (surface - marker.centre) / marker.radius
+            surface = rays.origin + rays.directions[nearer] * to_marker[nearer, None]
+            normal[nearer] = surface - marker.centre
             colour[nearer] = marker.colour
             np.minimum(distance, to_marker, out=distance)
-        picture = shade(colour, normal, caster.directions)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), MIN_LENGTH)
+        picture = shade(colour, normal, rays.directions)
         picture[np.isinf(distance)] = BACKGROUND
         return picture.reshape(self.camera.height, self.camera.width, 3)
 
@@ -93,7 +98,7 @@ def _distances(caster: RayCaster, model: mujoco.MjModel, data: mujoco.MjData, ma
     """The distance to the nearest surface or marker along each ray, (R,) [m]."""
     distance = caster.cast(model, data).distance
     for marker in markers:
-        to_marker = ray_sphere_distances(caster.origin, caster.directions, marker.centre, marker.radius)
+        to_marker = ray_sphere_distances(caster.rays.origin, caster.rays.directions, marker.centre, marker.radius)
         np.minimum(distance, to_marker, out=distance)
     return distance
 

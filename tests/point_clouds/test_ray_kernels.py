@@ -1,0 +1,133 @@
+"""Compiled rays against MuJoCo's own, ray by ray, on random scenes."""
+
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lerobot_uca import point_clouds
+from lerobot_uca.point_clouds import ray_casting, single_rays
+from lerobot_uca.point_clouds.geometry import Camera
+from lerobot_uca.point_clouds.ray_casting import RayCaster
+from lerobot_uca.point_clouds.ray_kernels import cast_at
+from lerobot_uca.point_clouds.rays import Hits, Rays
+
+CAMERA = Camera.from_fovy("top", (0.0, 0.0, 1.5), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), 70.0, (48, 36))
+ALL = np.ones(48 * 36, bool)
+RAYS = Rays.of(CAMERA, ALL)
+SIZES = {
+    "sphere": "0.2",
+    "capsule": "0.1 0.2",
+    "ellipsoid": "0.1 0.2 0.3",
+    "cylinder": "0.15 0.2",
+    "box": "0.1 0.2 0.15",
+    "plane": "0.4 0.3 0.1",
+    "mesh": None,
+}
+
+
+def scene(kinds: list[str], seed: int, *, moving: bool = True) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Geoms at random poses around the origin, the mesh being the hull of random points."""
+    rng = np.random.default_rng(seed)
+    points = " ".join(f"{value:.4f}" for value in rng.uniform(-0.2, 0.2, 90))
+    bodies = ""
+    for kind in kinds:
+        position = " ".join(map(str, rng.uniform(-0.5, 0.5, 3)))
+        euler = " ".join(map(str, Rotation.random(random_state=rng).as_euler("xyz", degrees=True)))
+        size = 'mesh="rock"' if kind == "mesh" else f'size="{SIZES[kind]}"'
+        joint = '<freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>' * (moving and kind != "plane")
+        bodies += f'<body pos="{position}" euler="{euler}">{joint}<geom type="{kind}" {size}/></body>'
+    xml = f'<mujoco><asset><mesh name="rock" vertex="{points}"/></asset><worldbody>{bodies}</worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def both(model: mujoco.MjModel, data: mujoco.MjData, rays: Rays) -> tuple[Hits, Hits]:
+    hits = [Hits.none(len(rays.directions), with_normals=True) for _ in range(2)]
+    for cast, each in zip((cast_at, single_rays.cast_at), hits, strict=True):
+        cast(np.arange(model.ngeom), model, data, rays, each)
+    return hits[0], hits[1]
+
+
+def assert_equal(hits: Hits, expected: Hits) -> None:
+    np.testing.assert_array_equal(hits.geom, expected.geom)
+    np.testing.assert_allclose(hits.distance, expected.distance, rtol=1e-12)
+    hit = hits.geom >= 0
+    units = [each.normal[hit] / np.linalg.norm(each.normal[hit], axis=1, keepdims=True) for each in (hits, expected)]
+    np.testing.assert_allclose(np.abs(np.sum(units[0] * units[1], axis=1)), 1, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_hits_of_one_geom(kind):
+    n_hits = 0
+    for seed in range(6):
+        hits, expected = both(*scene([kind], seed), RAYS)
+        assert_equal(hits, expected)
+        n_hits += np.sum(hits.geom >= 0)
+        if kind == "mesh":
+            np.testing.assert_array_equal(hits.distance, expected.distance)  # bit by bit
+    assert n_hits > 50
+
+
+def test_hits_of_a_crowd():
+    for seed in range(4):
+        hits, expected = both(*scene([*SIZES, *SIZES], seed), RAYS)
+        assert_equal(hits, expected)
+        assert len(set(hits.geom)) > 6
+
+
+@pytest.mark.parametrize("height", [0.0, 0.1, 0.3])
+def test_a_camera_amid_the_geoms(height):
+    """Geoms reach behind the camera, or hold it."""
+    pose = Rotation.from_euler("xyz", [100, 20, 30], degrees=True).as_matrix()
+    rays = Rays.of(Camera.from_fovy("amid", (0.05, 0.1, height), pose, 100.0, (48, 36)), ALL)
+    for seed in range(4):
+        assert_equal(*both(*scene([*SIZES], seed), rays))
+
+
+def test_only_rays_that_matter_are_cast():
+    model, data = scene([*SIZES], 3)
+    matters = np.random.default_rng(0).random(len(ALL)) < 0.3
+    hits = RayCaster(CAMERA, matters).cast(model, data)
+    np.testing.assert_array_equal(hits.distance, RayCaster(CAMERA).cast(model, data).distance[matters])
+    assert np.isfinite(hits.distance).sum() > 50
+
+
+def test_invisible_geoms_are_not_hit():
+    xml = """<mujoco><asset><material name="glass" rgba="1 1 1 0"/></asset><worldbody>
+      <geom type="box" size="1 1 0.1" pos="0 0 0.9" rgba="1 1 1 0"/>
+      <geom type="box" size="1 1 0.1" pos="0 0 0.6" material="glass"/>
+      <geom type="box" size="1 1 0.1" pos="0 0 0.3" group="3"/>
+      <geom name="seen" type="box" size="1 1 0.1"/>
+    </worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    geom = np.empty(1, np.int32)
+    mujoco.mj_ray(model, data, CAMERA.position, np.array([0, 0, -1.0]), single_rays.VISIBLE_GROUPS, 1, -1, geom)
+    assert geom[0] == model.geom("seen").id
+    assert set(RayCaster(CAMERA).cast(model, data).geom) == {geom[0], -1}
+
+
+def test_a_height_field():
+    xml = """<mujoco><asset><hfield name="hill" nrow="2" ncol="2" size="1 1 1 1"/></asset>
+      <worldbody><geom type="hfield" hfield="hill"/></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    with pytest.raises(ValueError, match="Rays are not cast at geoms of type hfield"):
+        RayCaster(CAMERA).cast(model, mujoco.MjData(model))
+
+
+def test_without_numba_mujoco_casts_the_same(monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "lerobot_uca.point_clouds.ray_kernels", None)
+    monkeypatch.delattr(point_clouds, "ray_kernels")
+    ray_casting._caster.cache_clear()
+    model, data = scene([*SIZES], 0)
+    slow = RayCaster(CAMERA, with_normals=True).cast(model, data)
+    assert "Rays are cast one by one, ten times slower than with Numba" in caplog.text
+    monkeypatch.undo()
+    ray_casting._caster.cache_clear()
+    assert_equal(RayCaster(CAMERA, with_normals=True).cast(model, data), slow)
