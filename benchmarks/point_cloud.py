@@ -1,4 +1,6 @@
-"""Milliseconds of the stages of an observation, before and after, of a step and of a picture: medians of an episode.
+"""Processor time [ms] of an observation's stages, before and after, of a step and of a picture: an episode's medians.
+
+All of it runs in one thread, and what else the machine does meanwhile hardly counts.
 
 all rays: MuJoCo's mj_multiRay at everything, as it was at first. near rays: what is fixed once, mj_multiRay along rays
 that pass near something that moves, in one thread, as it was then. rays, crop, sample: the observation's stages today.
@@ -7,10 +9,13 @@ python benchmarks/point_cloud.py --expert='../shared/adroit_experts/{task}.npz'
 """
 
 import argparse
+import time
+from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
-from common import print_provenance, timed
+from common import print_provenance
 from lerobot.envs import make_env_config
 
 from lerobot_uca.envs.configs import PointCloudEnvConfig
@@ -33,7 +38,7 @@ def main() -> None:
     parser.add_argument("--expert", help="who acts in Adroit, as for lerobot-uca-collect; random actions by default")
     args = parser.parse_args()
     print_provenance()
-    print(f"{'ms, median':36}" + "".join(f"{name:>14}" for name in STAGES))
+    print(f"{'processor time [ms], median':36}" + "".join(f"{name:>14}" for name in STAGES))
     for kind, tasks in TASKS.items():
         for task in tasks:
             config = make_env_config(kind, task=task)
@@ -70,6 +75,13 @@ def measure(config: PointCloudEnvConfig, task: str, expert: Expert, n_steps: int
         picture, _ = timed(env.render)
         rows.append([all_rays, near_rays, rays, captured - rays, sample, observe, step, picture, len(points)])
     return np.array(rows)
+
+
+def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """Milliseconds of this thread that a call takes, and its result."""
+    start = time.thread_time()
+    result = function(*arguments)
+    return 1e3 * (time.thread_time() - start), result
 
 
 class MultiRay:
