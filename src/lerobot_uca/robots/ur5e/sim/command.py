@@ -31,12 +31,6 @@ class SimulatedWorld:
             self.controller.close()
             raise
 
-    def reset(self, task: str, seed: int) -> None:
-        """Put everything where an episode begins, the arm home."""
-        with self.controller.robot.lock:
-            self.scene.reset(task, seed, with_arm=True)
-            self.controller.robot.arm_was_moved()
-
     def close(self) -> None:
         """Stop serving."""
         self._server.close()
@@ -83,7 +77,7 @@ def main() -> None:
         file = write_calibration(options.calibration, options.camera, options.width, options.height)
         logger.info("Calibration of camera '%s': %s", options.camera, file)
     with SimulatedWorld(options.ip, Noise(options.noise, options.holes)) as world:
-        world.reset(options.task, options.seed)
+        world.service.reset(options.task, options.seed, with_arm=True)
         logger.info(
             "A simulated UR5e serves %s: --robot.type=ur5e_follower --robot.ip=%s. Ctrl-C ends it.",
             options.ip,

@@ -91,9 +91,7 @@ class SceneService:
             case "frame":
                 return self._frame(int(request["width"]), int(request["height"]), colour=bool(request["colour"]))
             case "reset":
-                with self._lock:
-                    self._task = request["task"]
-                    self._scene.reset(self._task, int(request["seed"]))
+                self.reset(request["task"], int(request["seed"]), with_arm=bool(request.get("with_arm", False)))
                 return self._state(), []
             case "state":
                 return self._state(), []
@@ -102,9 +100,18 @@ class SceneService:
                 return {}, []
         raise UserError(f"A request is frame, reset, state or fault, got '{request['request']}'.")
 
+    def reset(self, task: str, seed: int, *, with_arm: bool = False) -> None:
+        """Put the things where an episode begins; `with_arm` only while no client moves it: the arm, too."""
+        with self._lock:
+            self._scene.reset(task, seed, with_arm=with_arm)
+            self._task = task
+            if with_arm:
+                self._controller.robot.arm_was_moved()
+
     def _state(self) -> dict[str, Any]:
         with self._lock:
-            return {"task": self._task, "success": self._scene.is_success(self._task), **self._scene.objects()}
+            success, q = self._scene.is_success(self._task), self._scene.arm.q.tolist()
+            return {"task": self._task, "success": success, "q": q, **self._scene.objects()}
 
     def _frame(self, width: int, height: int, *, colour: bool) -> tuple[dict[str, Any], list[NDArray[Any]]]:
         if self._camera_fault == "dead_camera":

@@ -9,8 +9,10 @@ from lerobot.cameras import Camera
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 from numpy.typing import NDArray
 
+from lerobot_uca.point_clouds.depth import MILLIMETRE
+from lerobot_uca.robots.ur5e.depth_device import DepthDevice
 from lerobot_uca.robots.ur5e.sim.config_simulated_camera import SimulatedCameraConfig
-from lerobot_uca.robots.ur5e.sim.scene_service import SERIAL, SceneClient
+from lerobot_uca.robots.ur5e.sim.scene_service import SERIAL, SceneClient, simulated_camera
 
 FIRST_FRAME = 10.0  # [s]
 
@@ -104,6 +106,14 @@ class SimulatedCamera(Camera):
             if age > max_age_ms:
                 raise TimeoutError(f"the newest frame is {age:.0f} ms old, at most {max_age_ms} ms are allowed")
             return self._frame
+
+    def depth_device(self) -> DepthDevice:
+        """What a real camera's driver says of its depth stream."""
+        assert self.width is not None
+        assert self.height is not None
+        camera = simulated_camera(self.width, self.height)
+        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        return DepthDevice(SERIAL, *intrinsics, depth_unit=MILLIMETRE)
 
     def read(self) -> NDArray[Any]:
         """The next colour frame (H, W, 3), or depth from a camera without colour."""
