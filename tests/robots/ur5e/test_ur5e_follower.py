@@ -228,6 +228,20 @@ def test_a_fault_ends_standing_still_and_in_one_line(controller, robot, line, fa
         robot.get_observation()
 
 
+@pytest.mark.parametrize(("fault", "size"), [("latency", 0.05), ("drop", 0.1)])
+def test_a_bad_network_is_ridden_out_and_ends_standing_still(controller, robot, fault, size):
+    """Late packets move the arm late. Where ur_rtde waits for an answer that is lost, the watchdog ends the program."""
+    setattr(controller.network, fault, size)
+    last = stream(robot, 0.3, seconds=1.0)
+    wait_until(lambda: np.abs(last - controller.robot.arm.q).max() < 2e-3)
+    keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    robot.disconnect()
+    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
+    wait_until(lambda: stands_still(controller))
+    assert not controller.robot.stop_reason
+
+
 def test_disconnecting_stops_a_moving_arm_and_frees_it(controller, robot, tmp_path):
     keep_moving(robot)
     wait_until(lambda: speed(controller) > 0.1)
