@@ -26,14 +26,16 @@ from tqdm import tqdm
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.data.cloud_report import EpisodeReport, write_report
-from lerobot_uca.data.cloud_sources import LeRobotSource, Source, find_source
+from lerobot_uca.data.sources.find import find_source
+from lerobot_uca.data.sources.lerobot_source import LeRobotSource
+from lerobot_uca.data.sources.source import Source
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import MIN_SHARE
 from lerobot_uca.point_clouds.geometry import sample_farthest
-from lerobot_uca.point_clouds.recipe import RECIPE_INFO, depth_keys, make_crop
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, make_crop
 
 logger = logging.getLogger(__name__)
 
@@ -120,12 +122,8 @@ def make_source(config: ConvertConfig) -> Source:
     try:
         crop = make_crop(*corners) if corners else None
         source = find_source(config.source, crop, config.task, colour=config.colour)
-        if isinstance(source, LeRobotSource):
-            has_depth = bool(depth_keys(source.features))
-            if has_depth and config.colour:
-                raise UserError("--colour=true needs points with colours: depth images have none.")
-            if has_depth:
-                source.make_clouds(corners, config.n_points, config.calibration)
+        if isinstance(source, LeRobotSource) and source.has_depth:
+            source.make_clouds(corners, config.n_points, config.calibration)
     except CalibrationError as error:
         raise UserError(str(error)) from error
     return source

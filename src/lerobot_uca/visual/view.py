@@ -20,12 +20,13 @@ from lerobot.envs.configs import EnvConfig
 from numpy.typing import NDArray
 
 from lerobot_uca.bounds import check_bounds, within
-from lerobot_uca.data.cloud_sources import LeRobotSource, find_source
+from lerobot_uca.data.sources.find import find_source
+from lerobot_uca.data.sources.lerobot_source import LeRobotSource
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.geometry import Crop
-from lerobot_uca.point_clouds.recipe import depth_keys, make_crop
+from lerobot_uca.point_clouds.recipe import make_crop
 from lerobot_uca.visual.crop_page import CropPage, colours_of
 from lerobot_uca.visual.live_camera import live_clouds
 
@@ -99,7 +100,7 @@ def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
     assert config.source is not None
     try:
         source = find_source(config.source, None, "", colour=config.colour)
-        if isinstance(source, LeRobotSource) and depth_keys(source.features):
+        if isinstance(source, LeRobotSource) and source.has_depth:
             source.make_clouds((WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration)
     except CalibrationError as error:
         raise UserError(str(error)) from error

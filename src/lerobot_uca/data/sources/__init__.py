@@ -1,0 +1,1 @@
+"""Sources of recorded clouds: LeRobot datasets, DP3's zarr, folders of files."""

@@ -1,0 +1,167 @@
+"""Clouds in files: DP3's zarr, and folders of PLY or NPZ files."""
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.data.sources.source import ACTION, Frame, Source
+from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.geometry import Crop
+
+ZARR_KEYS = ("data/point_cloud", "data/state", "data/action", "meta/episode_ends")
+
+
+@dataclass
+class ZarrSource(Source):
+    """Data as DP3 stores them: data/point_cloud, data/state, data/action by step, and meta/episode_ends."""
+
+    path: Path
+    crop: Crop | None = None
+    task: str = ""
+    colour: bool = False
+
+    @cached_property
+    def _group(self) -> Any:
+        try:
+            import zarr
+        except ImportError as error:
+            raise UserError("DP3's data need zarr: pip install 'lerobot_policy_uca_flow[convert]'.") from error
+        try:
+            group: Any = zarr.open_group(str(self.path), mode="r")
+            missing = [key for key in ZARR_KEYS if key not in group]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"'{self.path}' cannot be read as zarr: {' '.join(str(error).split())}") from error
+        if missing:
+            found = ", ".join(sorted(f"{name}/{key}" for name, part in group.groups() for key in part)) or "nothing"
+            raise UserError(
+                f"'{self.path}' must hold {', '.join(ZARR_KEYS)}; {', '.join(missing)} is missing, got {found}."
+            )
+        lengths = {key: group[key].shape[0] for key in ZARR_KEYS[:3]}
+        ends = np.asarray(group[ZARR_KEYS[3]])
+        shape = group[ZARR_KEYS[0]].shape
+        if len({*lengths.values(), int(ends[-1]) if len(ends) else 0}) != 1 or np.any(np.diff(ends, prepend=0) <= 0):
+            raise UserError(f"'{self.path}': meta/episode_ends must rise to the number of steps {lengths}, got {ends}.")
+        if len(shape) != 3 or shape[2] < 3:
+            raise UserError(f"'{self.path}': data/point_cloud must have shape (steps, N, 3 or more), got {shape}.")
+        return group
+
+    @property
+    def n_episodes(self) -> int:
+        """The number of episodes."""
+        return self._group[ZARR_KEYS[3]].shape[0]
+
+    def frames(self, episode: int) -> list[Frame]:
+        """The steps of one episode."""
+        ends = np.asarray(self._group[ZARR_KEYS[3]])
+        steps = slice(int(ends[episode - 1]) if episode else 0, int(ends[episode]))
+        columns = [np.asarray(self._group[key][steps], dtype=np.float32) for key in ZARR_KEYS[:3]]
+        return [
+            Frame(*self._cropped(cloud), np.atleast_1d(state), np.atleast_1d(action), self.task)
+            for cloud, state, action in zip(*columns, strict=True)
+        ]
+
+    def left_out(self) -> list[str]:
+        """Arrays that are not kept, and colours."""
+        kept = {key.partition("/")[2] for key in ZARR_KEYS[:3]}
+        has_colours = self._group[ZARR_KEYS[0]].shape[2] > 3
+        colours = ["colours of data/point_cloud"] if has_colours and not self.colour else []
+        return [f"data/{key}" for key in self._group["data"] if key not in kept] + colours
+
+
+@dataclass
+class FolderSource(Source):
+    """PLY or NPZ files, and a frames.csv that lists them in their order.
+
+    Its columns: file, episode, state_* and action_* (in the order of the vectors), and task if it is not given.
+    A PLY file holds vertices with x, y, z [m] and perhaps red, green, blue; an NPZ file an array 'points' (N, 3) [m],
+    or (N, 6) with RGB after xyz.
+    """
+
+    path: Path
+    crop: Crop | None = None
+    task: str = ""
+    colour: bool = False
+
+    @cached_property
+    def _rows(self) -> list[dict[str, str]]:
+        file = self.path / "frames.csv"
+        try:
+            with file.open(newline="", encoding="utf-8") as opened:
+                rows = list(csv.DictReader(opened))
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"'{file}' cannot be read: {error}") from error
+        columns = list(rows[0]) if rows else []
+        vectors = [self._columns(columns, kind) for kind in ("state", "action")]
+        if not {"file", "episode"} <= set(columns) or not all(vectors):
+            got = ", ".join(columns) or "none"
+            raise UserError(f"'{file}' must have the columns file, episode, state_*, action_*, got {got}.")
+        return rows
+
+    @staticmethod
+    def _columns(columns: Sequence[str], kind: str) -> list[str]:
+        return [name for name in columns if name.startswith(f"{kind}_")]
+
+    @cached_property
+    def _episodes(self) -> list[list[dict[str, str]]]:
+        by_name: dict[str, list[dict[str, str]]] = {}
+        for row in self._rows:
+            by_name.setdefault(row["episode"], []).append(row)
+        return list(by_name.values())
+
+    @property
+    def n_episodes(self) -> int:
+        """The number of episodes."""
+        return len(self._episodes)
+
+    def names(self, key: str) -> list[str] | None:
+        """The columns' names without their prefix."""
+        kind = "action" if key == ACTION else "state"
+        return [name.removeprefix(f"{kind}_") for name in self._columns(list(self._rows[0]), kind)]
+
+    def frames(self, episode: int) -> list[Frame]:
+        """The steps of one episode."""
+        return [self._frame(row) for row in self._episodes[episode]]
+
+    def _frame(self, row: dict[str, str]) -> Frame:
+        file = self.path / row["file"]
+        reader = READERS.get(file.suffix.lower())
+        if reader is None:
+            raise UserError(f"'{file}' must be one of {', '.join(READERS)}.")
+        try:
+            points = reader(file)
+            state, action = (
+                np.array([float(row[name]) for name in self._columns(list(row), kind)], dtype=np.float32)
+                for kind in ("state", "action")
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"'{file}' (frames.csv) cannot be read: {' '.join(str(error).split())}") from error
+        if points.ndim != 2 or points.shape[1] < 3:
+            raise UserError(f"'{file}' must hold points (N, 3 or more), got shape {points.shape}.")
+        return Frame(*self._cropped(points), state, action, row.get("task") or self.task)
+
+
+def _read_ply(file: Path) -> NDArray[Any]:
+    try:
+        from plyfile import PlyData, PlyParseError
+    except ImportError as error:
+        raise UserError("PLY files need plyfile: pip install 'lerobot_policy_uca_flow[convert]'.") from error
+    try:
+        vertices = PlyData.read(str(file))["vertex"]
+    except PlyParseError as error:
+        raise ValueError(str(error)) from error
+    colours = [name for name in ("red", "green", "blue") if name in vertices]
+    return np.stack([vertices[name].astype(np.float32) for name in ("x", "y", "z", *colours)], axis=1)
+
+
+def _read_npz(file: Path) -> NDArray[Any]:
+    with np.load(file, allow_pickle=False) as arrays:
+        return arrays["points"]
+
+
+READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".ply": _read_ply, ".npz": _read_npz}

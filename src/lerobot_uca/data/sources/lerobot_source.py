@@ -1,0 +1,149 @@
+"""LeRobot datasets with depth images or clouds."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.data.recorded_calibrations import EXTRINSICS, INTRINSICS, recorded_calibrations
+from lerobot_uca.data.sources.source import ACTION, STATE, Frame, Source
+from lerobot_uca.errors import UserError
+from lerobot_uca.features import VALID_MASK_SUFFIX, find_point_cloud
+from lerobot_uca.point_clouds.depth import DepthError, is_valid
+from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe, camera_of, depth_keys, recipe_for
+
+
+@dataclass
+class LeRobotSource(Source):
+    """A LeRobot dataset with depth images, as video or as TIFF, or with clouds under this or another plugin's key.
+
+    Args:
+        path: its folder.
+        crop: for clouds; depth is cropped by its recipe.
+        colour: whether clouds keep their colours, RGB after xyz.
+        depth_recipe: how clouds are made from depth; None takes the dataset's own clouds.
+    """
+
+    path: Path
+    crop: Crop | None = None
+    colour: bool = False
+    depth_recipe: CloudRecipe | None = None
+
+    @cached_property
+    def _dataset(self) -> Any:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset  # slow to import
+
+        return LeRobotDataset(self.path.name, root=self.path)
+
+    @property
+    def features(self) -> dict[str, Any]:
+        """The dataset's features, as LeRobot describes them."""
+        return self._dataset.features
+
+    @property
+    def n_episodes(self) -> int:
+        """The number of episodes."""
+        return self._dataset.num_episodes
+
+    @property
+    def fps(self) -> int:
+        """Steps a second."""
+        return self._dataset.fps
+
+    @property
+    def recipe(self) -> CloudRecipe | None:
+        """The recipe of the depth images, or the one that the dataset's clouds were made with."""
+        if self.depth_recipe is None and self._cloud_key is not None:
+            made_with = (self.features[self._cloud_key].get("info") or {}).get(RECIPE_INFO)
+            return CloudRecipe.from_dict(made_with) if made_with and self.crop is None else None
+        return self.depth_recipe
+
+    def names(self, key: str) -> list[str] | None:
+        """The names of a feature's numbers."""
+        return self.features[key].get("names")
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether there are depth images."""
+        return bool(depth_keys(self.features))
+
+    def make_clouds(self, corners: tuple[Any, Any] | None, n_points: int, folder: str | None) -> None:
+        """Make clouds from the depth images from now on.
+
+        Args:
+            corners: of the crop; None for that of a simulated camera.
+            n_points: of a cloud.
+            folder: of calibrations. Without one the dataset's own count, and then those of $LEROBOT_UCA_CALIBRATION.
+
+        Raises:
+            CalibrationError: if a calibration or the crop is missing.
+            UserError: if colours are wanted, or the dataset's own calibration is that of a moving camera.
+        """
+        if self.colour:
+            raise UserError("--colour=true needs points with colours: depth images have none.")
+        recorded = {} if folder else recorded_calibrations(self._dataset)
+        self.depth_recipe = recipe_for(self.features, corners, n_points, folder, recorded)
+
+    def seen(self, episode: int, frame: int) -> str:
+        """The part of the scene that the crop covers in one step, in a line."""
+        if self.depth_recipe is None:
+            return super().seen(episode, frame)
+        item = self._dataset[self._dataset.meta.episodes[episode]["dataset_from_index"] + frame]
+        return self._make.seen([item[key].numpy() for key in self.depth_recipe.keys])
+
+    def left_out(self) -> list[str]:
+        """Features that are neither cloud, depth, state nor action."""
+        kept = {STATE, ACTION, self._cloud_key, self._rgb_key}
+        if self.depth_recipe is not None:
+            cameras = [camera_of(key) for key in self.depth_recipe.keys]
+            kept |= {*self.depth_recipe.keys, *(kind + each for kind in (INTRINSICS, EXTRINSICS) for each in cameras)}
+        own = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
+        return [key for key in self.features if key not in kept | own]
+
+    def frames(self, episode: int) -> list[Frame]:
+        """The steps of one episode."""
+        row = self._dataset.meta.episodes[episode]
+        items = (self._dataset[index] for index in range(row["dataset_from_index"], row["dataset_to_index"]))
+        return [self._frame(item) for item in items]
+
+    @cached_property
+    def _cloud_key(self) -> str | None:
+        return find_point_cloud(self.features)
+
+    @cached_property
+    def _rgb_key(self) -> str | None:
+        """The colours' feature, where they are not in the cloud's and are wanted."""
+        key = (self._cloud_key or "").removesuffix(".xyz") + ".rgb"
+        return key if self.colour and key in self.features else None
+
+    @cached_property
+    def _make(self) -> Any:
+        return self.depth_recipe.make() if self.depth_recipe else None
+
+    def _frame(self, item: dict[str, Any]) -> Frame:
+        seen = self._from_depth(item) if self._make else self._from_cloud(item)
+        state, action = (np.atleast_1d(item[key].numpy()).astype(np.float32) for key in (STATE, ACTION))
+        return Frame(*seen, state, action, item["task"])
+
+    def _from_depth(self, item: dict[str, Any]) -> tuple[NDArray[np.float32], int, float]:
+        assert self.depth_recipe is not None
+        images = [item[key].numpy() for key in self.depth_recipe.keys]
+        try:
+            candidates, n_points = self._make.candidates(images), len(self._make.points(images))
+            valid = [is_valid(view, image).mean() for view, image in zip(self._make.views, images, strict=True)]
+        except DepthError as error:
+            raise UserError(str(error)) from error
+        return candidates, n_points, 1 - float(np.mean(valid))
+
+    def _from_cloud(self, item: dict[str, Any]) -> tuple[NDArray[np.float32], int, float]:
+        if self._cloud_key is None:
+            raise UserError(f"'{self.path}' has neither depth nor a point cloud, got {', '.join(self.features)}.")
+        cloud = item[self._cloud_key].numpy()
+        if self._rgb_key is not None:
+            cloud = np.concatenate([cloud, item[self._rgb_key].numpy()], axis=-1)
+        mask = item.get(self._cloud_key.removesuffix(".xyz") + VALID_MASK_SUFFIX)
+        return self._cropped(cloud if mask is None else cloud[mask.numpy().astype(bool)])

@@ -1,0 +1,94 @@
+"""The base of all sources of recorded clouds.
+
+A source is light to send to another process and opens its files there. Letters: L steps, N points.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.point_clouds.recipe import CloudRecipe
+
+ACTION, STATE = "action", "observation.state"
+
+
+class Frame(NamedTuple):
+    """One step as it was recorded."""
+
+    points: NDArray[np.float32]  # (any number, 3) [m], or 6 with RGB; inside the crop; of depth the sampled ones
+    n_points: int  # inside the crop
+    invalid: float  # share of pixels without depth, or of points that are not finite
+    state: NDArray[np.float32]  # (S,)
+    action: NDArray[np.float32]  # (A,)
+    task: str
+
+
+class Source(ABC):
+    """Recorded episodes."""
+
+    path: Path
+    crop: Crop | None
+    colour: bool
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what has been opened: another process opens it itself."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}  # type: ignore[attr-defined]
+
+    @property
+    @abstractmethod
+    def n_episodes(self) -> int:
+        """The number of episodes."""
+
+    @abstractmethod
+    def frames(self, episode: int) -> list[Frame]:
+        """The steps of one episode."""
+
+    def seen(self, episode: int, frame: int) -> str:
+        """The part of the scene that the crop covers in one step, in a line."""
+        points = replace(self, crop=None).frames(episode)[frame].points[:, :3]  # type: ignore[type-var]
+        if len(points) == 0:
+            return "The cloud has no finite point"
+        low, high = (np.round(np.percentile(points, share, axis=0), 3).tolist() for share in (1, 99))
+        crop = f"the crop is {self.crop.low} to {self.crop.high} m" if self.crop else "there is no crop"
+        return f"The cloud has {len(points)} finite points from {low} to {high} m; {crop}"
+
+    @property
+    def fps(self) -> int | None:
+        """Steps a second, if the source knows it."""
+        return None
+
+    @property
+    def recipe(self) -> CloudRecipe | None:
+        """The recipe by which clouds are made from depth images, if they are."""
+        return None
+
+    def names(self, _: str) -> list[str] | None:
+        """The names of a feature's numbers, if the source knows them."""
+        return None
+
+    def left_out(self) -> list[str]:
+        """The parts of the source that are not kept."""
+        return []
+
+    def _cropped(self, points: NDArray[Any]) -> tuple[NDArray[np.float32], int, float]:
+        """The finite points inside the crop, of (N, 3 or more), their number, and the share that is not finite.
+
+        Raises:
+            UserError: if their colours are wanted and they have none.
+        """
+        n_channels = 6 if self.colour else 3
+        if points.shape[1] < n_channels:
+            raise UserError(
+                f"--colour=true needs points with RGB after xyz, (N, 6), got {points.shape} in '{self.path}'."
+            )
+        wanted = np.asarray(points, dtype=np.float32)[:, :n_channels]
+        finite = np.asarray(np.all(np.isfinite(wanted), axis=1))
+        xyz = np.where(finite[:, None], wanted[:, :3], np.inf)
+        inside = finite if self.crop is None else finite & self.crop.contains(xyz)
+        return wanted[inside], int(inside.sum()), 1 - float(finite.mean()) if len(finite) else 1.0
