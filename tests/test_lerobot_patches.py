@@ -17,6 +17,7 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.scripts import lerobot_eval
 
 from lerobot_uca import configs, lerobot_patches
 from lerobot_uca.data import batched_dataset
@@ -159,6 +160,20 @@ def test_every_private_name_is_listed():
             if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "lerobot":
                 private = {f"{node.module}.{alias.name}" for alias in node.names if alias.name.startswith("_")}
                 assert private <= listed, path
+
+
+def test_every_patched_name_is_listed():
+    listed = set(lerobot_patches.USED_NAMES)
+    names = {**vars(lerobot_patches), "evaluation": lerobot_eval}
+    calls = [
+        node for node in ast.walk(ast.parse(Path(lerobot_patches.__file__).read_text())) if isinstance(node, ast.Call)
+    ]
+    patches = [call for call in calls if ast.unparse(call.func).startswith("_replace")]
+    assert len(patches) > 10
+    for call in patches:
+        target = eval(ast.unparse(call.args[0]), names)
+        method = f".{call.args[1].value}" if ast.unparse(call.func) != "_replace" else ""
+        assert f"{target.__module__}.{target.__qualname__}{method}" in listed
 
 
 def test_installing_twice_changes_nothing():

@@ -46,23 +46,35 @@ SUPPORTED_LEROBOT = "0.6.1"
 EVALUATION_MODULES = ("lerobot.scripts.lerobot_eval", "__main__")
 
 USED_NAMES = (
-    # Private names and functions without a promise, by module: a port to another LeRobot starts here.
-    *("lerobot.common.train_utils.save_checkpoint", "lerobot.common.train_utils.update_last_checkpoint"),
-    *("lerobot.common.train_utils.load_training_state", "lerobot.common.train_utils.push_checkpoint_to_hub"),
-    *("lerobot.configs.parser.parse_arg", "lerobot.configs.policies.PreTrainedConfig.from_pretrained"),
-    *(
-        "lerobot.configs.train.TrainPipelineConfig.validate",
-        "lerobot.configs.train.TrainPipelineConfig.from_pretrained",
-    ),
-    *("lerobot.configs.eval.EvalPipelineConfig.__post_init__", "lerobot.datasets.factory.LeRobotDataset"),
-    *("lerobot.datasets.factory.make_dataset", "lerobot.datasets.sampler.EpisodeAwareSampler.state_dict"),
-    *("lerobot.datasets.lerobot_dataset.LeRobotDataset._ensure_reader", "lerobot.envs.utils._LazyAsyncVectorEnv"),
-    *("lerobot.datasets.dataset_reader.DatasetReader.load_and_activate", "lerobot.envs.utils.freeze_after_episode_end"),
-    *("lerobot.policies.factory.make_pre_post_processors", "lerobot.utils.random_utils.get_rng_state"),
-    *("lerobot.policies.pretrained.PreTrainedPolicy._load_as_safetensor", "lerobot.utils.random_utils.set_rng_state"),
-    *("lerobot.policies.pretrained.PreTrainedPolicy.push_model_to_hub",),
-    *("lerobot.processor.pipeline.DataProcessorPipeline._build_steps_from_config",),
-    *("lerobot.processor.pipeline.DataProcessorPipeline.push_to_hub", "lerobot.scripts.lerobot_eval.eval_policy_all"),
+    # Private names and functions without a promise: a port to another LeRobot starts here.
+    "lerobot.common.train_utils.load_training_state",
+    "lerobot.common.train_utils.push_checkpoint_to_hub",
+    "lerobot.common.train_utils.save_checkpoint",
+    "lerobot.common.train_utils.update_last_checkpoint",
+    "lerobot.configs.eval.EvalPipelineConfig.__post_init__",
+    "lerobot.configs.parser.parse_arg",
+    "lerobot.configs.policies.PreTrainedConfig.from_pretrained",
+    "lerobot.configs.train.TrainPipelineConfig.from_pretrained",
+    "lerobot.configs.train.TrainPipelineConfig.validate",
+    "lerobot.datasets.dataset_reader.DatasetReader.load_and_activate",
+    "lerobot.datasets.factory.LeRobotDataset",
+    "lerobot.datasets.factory.make_dataset",
+    "lerobot.datasets.factory.make_train_eval_datasets",
+    "lerobot.datasets.lerobot_dataset.LeRobotDataset._ensure_reader",
+    "lerobot.datasets.sampler.EpisodeAwareSampler.state_dict",
+    "lerobot.envs.utils._LazyAsyncVectorEnv",
+    "lerobot.envs.utils.freeze_after_episode_end",
+    "lerobot.policies.factory.make_pre_post_processors",
+    "lerobot.policies.pretrained.PreTrainedPolicy._load_as_safetensor",
+    "lerobot.policies.pretrained.PreTrainedPolicy.push_model_to_hub",
+    "lerobot.processor.pipeline.DataProcessorPipeline._build_steps_from_config",
+    "lerobot.processor.pipeline.DataProcessorPipeline.push_to_hub",
+    "lerobot.scripts.lerobot_eval._build_raw_frame",
+    "lerobot.scripts.lerobot_eval._env_features_to_dataset_features",
+    "lerobot.scripts.lerobot_eval.eval_policy_all",
+    "lerobot.utils.random_utils.get_rng_state",
+    "lerobot.utils.random_utils.set_rng_state",
+    "lerobot.utils.utils.cycle",
 )
 SWITCH = "LEROBOT_UCA_BATCHED_READING"
 
