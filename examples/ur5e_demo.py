@@ -16,93 +16,120 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
+import av
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_uca.robots.ur5e.sim.robot import HOME
 from lerobot_uca.robots.ur5e.sim.scene_service import SceneClient
 
 FPS = 30
-EPISODE = {"pick_place": 9, "drawer_close": 5}  # [s], a demonstration and the holding still after it
-STEPS = {"pick_place": 1200, "drawer_close": 500}
-SENTENCE = {"pick_place": "Put the cube into the box.", "drawer_close": "Close the drawer."}
+
+
+class Task(NamedTuple):
+    """A task's settings."""
+
+    sentence: str
+    seconds: int  # of a demonstration, the holding still after it included
+    crop: tuple[str, str]  # [m], corners in the base frame
+    n_points: int  # of a cloud
+    steps: int  # of training
+    options: str = ""  # of training
+
+
+TASKS = {
+    # Little of the arm, whose joints are known: the wide crop below leaves 10 of 256 points to the cube.
+    "pick_place": Task(
+        "Put the cube into the box.",
+        9,
+        crop=("[-0.63, -0.3, 0.005]", "[-0.36, 0.3, 0.15]"),
+        n_points=512,
+        steps=1200,
+        options="--policy.n_points=128",
+    ),
+    "drawer_close": Task(
+        "Close the drawer.", 5, crop=("[-0.8, -0.45, 0.005]", "[-0.2, 0.35, 0.5]"), n_points=1024, steps=500
+    ),
+}
 METHODS = {
     "uca_flow": "",
     "adaln": "--policy.conditioning=adaln",
     "cross_attention": "--policy.conditioning=cross_attention",
 }
 RESET = 3  # [s]
-CROP_LOW, CROP_HIGH, N_POINTS = "[-0.8, -0.45, 0.005]", "[-0.2, 0.35, 0.5]", 1024
 SEED = 1000  # of training
 FIRST_TRIAL = 1000  # seed: places that no demonstration has seen
 MOVED = 0.02  # [rad]: a trial's time begins when the arm is so far from home
-COLUMNS = ("task", "method", "seed", "steps", "demonstrations", "trial", "success", "seconds")
+FILM_RATE, FILM_SIZE = 15, (320, 240)  # [Hz], [pixels]
+COLUMNS = ("task", "method", "seed", "steps", "demonstrations", "points", "trial", "success", "seconds")
 
 
 def main() -> None:
     """Run everything that is not there yet, then report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--tasks", nargs="+", choices=tuple(EPISODE), default=tuple(EPISODE))
+    parser.add_argument("--tasks", nargs="+", choices=tuple(TASKS), default=tuple(TASKS))
     parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=["uca_flow"])
     parser.add_argument("--demonstrations", type=int, default=40)
-    parser.add_argument("--steps", type=int, help="of training (default: 1200 for pick_place, 500 for drawer_close)")
+    parser.add_argument("--steps", type=int, help="of training (default: the task's)")
     parser.add_argument("--trials", type=int, default=20)
     parser.add_argument("--ip", default="127.0.0.1", help="loopback address of the simulated arm")
     parser.add_argument("--output", type=Path, default=Path("outputs/ur5e_demo"))
     options = parser.parse_args()
     os.environ["LEROBOT_UCA_CALIBRATION"] = str(options.output / "calibrations")
-    summary = [line for task in options.tasks for line in run_task(task, options)]
+    summary = [line for name in options.tasks for line in run_task(name, TASKS[name], options)]
     print("\nSimulated:", *summary, f"trials: {options.output / 'trials.csv'}", sep="\n  ")
 
 
-def run_task(task: str, options: argparse.Namespace) -> list[str]:
+def run_task(name: str, task: Task, options: argparse.Namespace) -> list[str]:
     """Record, convert, train, roll out and replay; lines for the summary."""
-    folder, ip, seconds = options.output / task, options.ip, EPISODE[task]
+    folder, ip, seconds = options.output / name, options.ip, task.seconds
     dataset, clouds, calibrations = folder / "dataset", folder / "clouds", options.output / "calibrations"
     robot = f"--robot.type=ur5e_follower --robot.ip={ip} --robot.control_rate={FPS}"
     camera = f"--robot.cameras='{{top: {{type: ur5e_sim, ip: {ip}, fps: {FPS}, width: 160, height: 120}}}}'"
-    data = f"--dataset.repo_id=local/{task} --dataset.root={dataset}"
-    steps = options.steps or STEPS[task]
+    data = f"--dataset.repo_id=local/{name} --dataset.root={dataset}"
+    steps = options.steps or task.steps
     lines = []
-    world = f"lerobot-uca-ur5e-sim --ip={ip} --task={task} --noise=0.001 --holes=0.02 --calibration={calibrations}"
+    world = f"lerobot-uca-ur5e-sim --ip={ip} --task={name} --noise=0.001 --holes=0.02 --calibration={calibrations}"
     with simulated_arm(world, ip) as scene:
         times = f"episode_time_s={seconds}", f"reset_time_s={RESET}"
         record = (
-            f"lerobot-record {robot} {camera} --teleop.type=ur5e_scripted --teleop.ip={ip} --teleop.task={task} "
+            f"lerobot-record {robot} {camera} --teleop.type=ur5e_scripted --teleop.ip={ip} --teleop.task={name} "
             f"--teleop.fps={FPS} --teleop.{times[0]} --teleop.{times[1]} {data} --dataset.fps={FPS} "
-            f"--dataset.single_task='{SENTENCE[task]}' --dataset.num_episodes={options.demonstrations} "
+            f"--dataset.single_task='{task.sentence}' --dataset.num_episodes={options.demonstrations} "
             f"--dataset.{times[0]} --dataset.{times[1]} --dataset.video=false --dataset.push_to_hub=false "
             "--play_sounds=false"
         )
         run(record, complete=dataset / "meta" / "info.json", unfinished=dataset)
         convert = (
-            f"lerobot-uca-convert --source={dataset} --repo_id=local/{task}_clouds --root={clouds} "
-            f"--crop_low='{CROP_LOW}' --crop_high='{CROP_HIGH}' --n_points={N_POINTS}"
+            f"lerobot-uca-convert --source={dataset} --repo_id=local/{name}_clouds --root={clouds} "
+            f"--crop_low='{task.crop[0]}' --crop_high='{task.crop[1]}' --n_points={task.n_points}"
         )
         run(convert, complete=clouds)
         for method in options.methods:
             training = folder / method
             checkpoint = training / "checkpoints" / "last" / "pretrained_model"
             train = (
-                f"lerobot-train --config_path=ur5e_small --dataset.repo_id=local/{task}_clouds --dataset.root={clouds} "
-                f"--output_dir={training} --steps={steps} --seed={SEED} {METHODS[method]}"
+                f"lerobot-train --config_path=ur5e_small --dataset.repo_id=local/{name}_clouds --dataset.root={clouds} "
+                f"--output_dir={training} --steps={steps} --seed={SEED} {task.options} {METHODS[method]}"
             )
             run(train, complete=checkpoint / "model.safetensors", unfinished=training)
             rollout = (
                 f"lerobot-rollout --policy.path={checkpoint} {robot} {camera} --fps={FPS} --duration={seconds + 2} "
-                f"--task='{SENTENCE[task]}' --play_sounds=false"
+                f"--task='{task.sentence}' --play_sounds=false"
             )
             n_successes = 0
             for trial in range(options.trials):
-                scene.ask(request="reset", task=task, seed=FIRST_TRIAL + trial, with_arm=True)
-                success, lasted = attempt(rollout, scene)
+                scene.ask(request="reset", task=name, seed=FIRST_TRIAL + trial, with_arm=True)
+                success, lasted = attempt(rollout, scene, film=folder / f"{method}.mp4" if trial == 0 else None)
                 n_successes += success
-                row = (task, method, SEED, steps, options.demonstrations, trial, int(success), lasted)
+                row = (name, method, SEED, steps, options.demonstrations, task.n_points, trial, int(success), lasted)
                 add_row(options.output / "trials.csv", row)
-            lines.append(f"{task} {method}: {n_successes} of {options.trials} trials succeeded")
-        scene.ask(request="reset", task=task, seed=0, with_arm=True)
+            lines.append(f"{name} {method}: {n_successes} of {options.trials} trials succeeded")
+        scene.ask(request="reset", task=name, seed=0, with_arm=True)
         run(f"lerobot-replay {robot} {data} --dataset.episode=0 --play_sounds=false")
-        lines.append(f"{task} replay: {'succeeded' if scene.ask(request='state')['success'] else 'failed'}")
+        lines.append(f"{name} replay: {'succeeded' if scene.ask(request='state')['success'] else 'failed'}")
     return lines
 
 
@@ -127,25 +154,39 @@ def simulated_arm(command: str, ip: str) -> Iterator[SceneClient]:
         process.wait()
 
 
-def attempt(command: str, scene: SceneClient) -> tuple[bool, str]:
-    """Run a rollout: whether its task was solved in the end, and the seconds from the first motion until it first was.
+def attempt(command: str, scene: SceneClient, film: Path | None) -> tuple[bool, str]:
+    """Run a rollout: was its task solved in the end, and in which time; the first one is filmed.
 
-    The seconds are empty where it was not.
+    The time is from the first motion until the task first was solved [s], empty where it was not.
     """
     print(f"\n$ {command}", flush=True)
     process = start(command)
-    began, lasted = 0.0, ""
+    began, lasted, pictures = 0.0, "", list[NDArray[np.uint8]]()
     while process.poll() is None:
         state = scene.ask(request="state")
         if not began and np.abs(np.array(state["q"]) - HOME).max() > MOVED:
             began = time.monotonic()
         if state["success"] and not lasted:
             lasted = f"{time.monotonic() - began:.1f}"
-        time.sleep(0.05)
+        if film and began and (picture := scene.frame(*FILM_SIZE, colour=True)[2]) is not None:
+            pictures.append(picture)
+        time.sleep(1 / FILM_RATE)
     check(process.returncode)
     success = bool(scene.ask(request="state")["success"])
     print(f"  ({f'success after {lasted} s' if success else 'no success'})")
+    if film:
+        write_film(film, pictures)
     return success, lasted if success else ""
+
+
+def write_film(file: Path, pictures: list[NDArray[np.uint8]]) -> None:
+    """Ray-cast pictures (H, W, 3) as an MP4."""
+    with av.open(str(file), "w") as container:
+        stream: av.VideoStream = container.add_stream("mpeg4", rate=FILM_RATE)
+        (stream.width, stream.height), stream.pix_fmt = FILM_SIZE, "yuv420p"
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        container.mux(stream.encode())
 
 
 def add_row(file: Path, row: tuple[object, ...]) -> None:

@@ -25,6 +25,9 @@ TINY = {
         *("--steps=2", "--batch_size=2", "--policy.dim=16", "--policy.n_layers=1", "--policy.n_heads=2"),
         *("--policy.n_points=16", "--policy.dtype=float32"),
     ],
+    "lerobot-uca-convert": [],
+    "lerobot-uca-view": [],
+    "lerobot-uca-saliency": [],
     "lerobot-rollout": ["--duration=1", "--return_to_initial_position=false"],
     "lerobot-replay": [],
 }
@@ -65,5 +68,10 @@ def test_every_command_of_the_recipe_runs(tmp_path, monkeypatch):
     finally:
         arm.terminate()
         arm.wait(10)
-    assert names == ["lerobot-record", "lerobot-train", "lerobot-rollout", "lerobot-replay"]
+    assert names == [
+        *("lerobot-record", "lerobot-uca-convert", "lerobot-uca-view", "lerobot-train"),
+        *("lerobot-uca-saliency", "lerobot-rollout", "lerobot-replay"),
+    ]
+    assert (tmp_path / "outputs" / "demonstration.rrd").stat().st_size > 10_000
+    assert list((tmp_path / "outputs" / "saliency").glob("*.png"))
     assert os.environ["LEROBOT_UCA_CALIBRATION"] == "calibrations"

@@ -125,6 +125,22 @@ def distance_to_path(points, path):
     return np.abs(points[:, None] - (start + share[..., None] * way)).max(axis=2).min(axis=1)
 
 
+def test_a_dataset_of_another_robot_moves_nothing(world, tmp_path):
+    address, _ = world
+    scene = SceneClient(address)
+    before = scene.ask(request="state")["q"]
+    action = {"dtype": "float32", "shape": (2,), "names": ["shoulder_pan.pos", "elbow_flex.pos"]}
+    dataset = LeRobotDataset.create("test/other", FPS, {"action": action}, root=tmp_path / "other", use_videos=False)
+    dataset.add_frame({"action": np.zeros(2, np.float32), "task": "another"})
+    dataset.save_episode()
+    dataset.finalize()
+    replayed = DatasetReplayConfig(repo_id="test/other", episode=0, root=tmp_path / "other")
+    with pytest.raises(UserError, match=r"unknown: elbow_flex\.pos\. Is the dataset .* another robot's"):
+        replay(ReplayConfig(robot=robot_config(address, tmp_path), dataset=replayed, play_sounds=False))
+    np.testing.assert_allclose(scene.ask(request="state")["q"], before, atol=1e-3)
+    scene.close()
+
+
 def test_the_calibration_is_the_cameras(world):
     _, folder = world
     calibration = read_calibrations(folder)["top"]
