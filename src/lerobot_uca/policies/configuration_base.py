@@ -53,7 +53,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # Training from depth images, which become clouds.
     depth: DepthConfig = field(default_factory=DepthConfig)
 
-    # Changes to training's clouds that make the policy robust to a real camera.
+    # Changes to training's clouds as a real camera would make them.
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
 
     # LeRobot takes the point cloud for a state: it is normalised by channel.

@@ -1,4 +1,4 @@
-"""The preprocessor step that changes training's clouds as a real camera would, so that a policy learns to bear it.
+"""The preprocessor step that changes training's clouds as a real camera would.
 
 Letters: B samples, O observation steps, N points, K cameras.
 """
