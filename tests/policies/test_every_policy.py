@@ -194,3 +194,20 @@ def test_a_runtime_computes_pytorchs_actions(variant, inference, caplog):
         actions = [policy.predict_action_chunk(observation, noise=noise) for policy in (fast, reference)]
         torch.testing.assert_close(*actions, atol=1e-5, rtol=0)
     assert not caplog.records  # PyTorch did not step in
+
+
+@pytest.mark.parametrize("inference", ["openvino", "onnxruntime"])
+def test_a_whole_history_goes_through_the_runtime(inference, monkeypatch, caplog):
+    fast, reference = (make("uca_flow", inference=each).eval() for each in (inference, "eager"))
+    noise, observations = torch.randn(1, fast.config.horizon, N_ACTIONS), [make_observation(), make_observation()]
+    history = {key: torch.stack([each[key] for each in observations], dim=1) for key in observations[0]}
+    fast.predict_action_chunk(history, noise=noise)  # traces
+
+    def pytorch(*_: object) -> None:
+        raise AssertionError("PyTorch computes")
+
+    monkeypatch.setattr(fast.ema_model.encoder, "forward", pytorch)
+    monkeypatch.setattr(fast.ema_model.generator, "forward", pytorch)
+    actions = [policy.predict_action_chunk(history, noise=noise) for policy in (fast, reference)]
+    torch.testing.assert_close(*actions, atol=1e-5, rtol=0)
+    assert not caplog.records
