@@ -38,7 +38,7 @@ class OpenVinoFunction(TracedFunction):
         def run(inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
             # NumPy copies: a thread that PyTorch has just used would spin on the core that OpenVINO's second one needs.
             for array, tensor in zip(held, inputs, strict=True):
-                array[...] = tensor.numpy()
+                np.copyto(array, tensor.numpy())
             request.infer(share_outputs=True)
             return tuple(torch.from_numpy(result.copy()) for result in results)  # the next call overwrites them
 

@@ -81,14 +81,15 @@ class TracedFunction(ABC):
         if network is not self._network or self._weights is None or self._weights.have_changed():
             self._network, self._weights = network, _Weights(network)
             self._traces.clear()
-        shapes = tuple(tensor.shape for tensor in inputs)
-        if shapes in self._traces:
-            self._traces.move_to_end(shapes)
-        else:
+        shapes = tuple([tensor.shape for tensor in inputs])
+        run = self._traces.get(shapes)
+        if run is None:
             if len(self._traces) == MAX_TRACES:
                 self._traces.popitem(last=False)
-            self._traces[shapes] = self._trace(network, shapes)
-        return self._traces[shapes](inputs)
+            run = self._traces[shapes] = self._trace(network, shapes)
+        elif len(self._traces) > 1:
+            self._traces.move_to_end(shapes)
+        return run(inputs)
 
     def _trace(self, network: nn.Module, shapes: Sequence[torch.Size]) -> Run:
         model = to_onnx(self.eager, network, shapes, [f"input_{index}" for index in range(len(shapes))])

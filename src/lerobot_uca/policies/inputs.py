@@ -84,7 +84,7 @@ def read_observations(
     if not shape[0]:
         raise UserError(f"The batch must hold at least one sample, got '{OBS_POINT_CLOUD}' of shape {shape}.")
     check_shape(OBS_STATE, state, (shape[0], *steps, config.n_states))
-    return Observations(cloud if shape[-2] == config.n_points else cloud[..., : config.n_points, :], state)
+    return Observations(cloud.narrow(-2, 0, config.n_points or shape[-2]), state)
 
 
 def check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
