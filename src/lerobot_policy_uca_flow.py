@@ -3,7 +3,11 @@
 import importlib
 import logging
 
+from lerobot_uca.lerobot_version import is_supported, warn_of_another
+
 logger = logging.getLogger(__name__)
+_missing: list[str] = []
+"""Parts that cannot be imported."""
 
 
 def _load(part: str) -> object | None:
@@ -11,7 +15,9 @@ def _load(part: str) -> object | None:
     try:
         return importlib.import_module(f"lerobot_uca.{part}")
     except Exception as error:  # noqa: BLE001
-        logger.warning("lerobot_uca.%s is not available: %s: %s", part, type(error).__name__, error)
+        _missing.append(part)
+        level = logging.WARNING if is_supported() else logging.DEBUG  # another LeRobot's line names all of them
+        logger.log(level, "lerobot_uca.%s is not available: %s: %s", part, type(error).__name__, error)
         return None
 
 
@@ -32,3 +38,5 @@ for _part in (
 _patches = _load("lerobot_patches")
 if _patches is not None:
     _patches.install()  # type: ignore[attr-defined]
+if not is_supported():
+    warn_of_another(_missing)

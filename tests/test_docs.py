@@ -24,6 +24,8 @@ NOT_RUN = {
     "make test": "is what runs this",
     "python3.12 -m venv": "installs",
     "pip install": "installs",
+    "python benchmarks/kills.py": "starts a training twenty times; tests/trust/test_checkpoints.py resumes one",
+    "python benchmarks/load.py": "takes a quarter of an hour, or trains in two processes",
     "accelerate launch": "tests/policies/test_distributed.py runs it, in two processes",
     "lerobot-train --policy.path=": "needs data under another name; tests/test_normalisation.py trains on some",
     "lerobot-uca-edit-dataset": "needs several episodes; tests/data/test_edit_dataset.py edits a dataset of three",

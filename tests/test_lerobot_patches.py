@@ -134,7 +134,7 @@ def test_only_the_dataset_factory_knows_the_batched_dataset():
     assert not hasattr(LeRobotDataset, "__getitems__")
 
 
-def test_another_lerobot_is_left_alone():
+def test_a_newer_lerobot_is_left_alone():
     code = (
         "import lerobot; lerobot.__version__ = '0.7.0'\n"
         "import lerobot_policy_uca_flow\n"
@@ -144,6 +144,19 @@ def test_another_lerobot_is_left_alone():
     result = run(code)
     assert result.stdout.strip() == "LeRobotDataset"
     assert "LeRobot 0.7.0 is too new: this package is made for 0.6.1." in result.stderr
+
+
+def test_an_older_lerobot_that_lacks_modules_is_named_in_one_line():
+    """0.6.0 has no lerobot.lerobot_types, among others."""
+    code = (
+        "import sys; sys.modules['lerobot.lerobot_types'] = None\n"
+        "import lerobot; lerobot.__version__ = '0.6.0'\n"
+        "import lerobot_policy_uca_flow"
+    )
+    (line,) = [line for line in run(code).stderr.splitlines() if "lerobot_uca" in line or "LeRobot" in line]
+    assert "LeRobot 0.6.0 is too old: this package is made for 0.6.1. Not available: " in line
+    assert "policies.processor_base" in line
+    assert line.endswith("To mend it: pip install lerobot==0.6.1")
 
 
 @pytest.mark.parametrize("name", lerobot_patches.USED_NAMES)

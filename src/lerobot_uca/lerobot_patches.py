@@ -13,7 +13,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import lerobot
 import torch
 import yaml
 from lerobot.common import train_utils
@@ -25,7 +24,6 @@ from lerobot.policies import factory as policy_factory
 from lerobot.processor import DataProcessorPipeline
 from lerobot.utils import utils
 from lerobot.utils.constants import ACTION, OBS_STATE
-from packaging.version import Version
 from tqdm import tqdm
 
 from lerobot_uca import configs
@@ -37,12 +35,12 @@ from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
 from lerobot_uca.errors import UserError, reported
 from lerobot_uca.features import ENV_NAMES, find_point_cloud, valid_mask
 from lerobot_uca.hub import upload_command, uploading
+from lerobot_uca.lerobot_version import is_supported
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_base import PointCloudProcessorStep, load_processors
 from lerobot_uca.policies.publishing import Evaluation, PublishedPolicy
 from lerobot_uca.processes import end_by_signals
 
-SUPPORTED_LEROBOT = "0.6.1"
 EVALUATION_MODULES = ("lerobot.scripts.lerobot_eval", "__main__")
 
 USED_NAMES = (
@@ -88,14 +86,7 @@ def install() -> None:
         end_by_signals()
     shorten_decoder_warning()
     make_registered_steps_only()
-    if lerobot.__version__ != SUPPORTED_LEROBOT:
-        logger.warning(
-            "LeRobot %s is too %s: this package is made for %s. Checkpoints are not written whole, resuming does not "
-            "repeat an unbroken run, and reading is slow. To mend it: pip install lerobot==%s",
-            lerobot.__version__,
-            "old" if Version(lerobot.__version__) < Version(SUPPORTED_LEROBOT) else "new",
-            *(SUPPORTED_LEROBOT, SUPPORTED_LEROBOT),
-        )
+    if not is_supported():
         return
     check_settings()
     find_configs_by_name()

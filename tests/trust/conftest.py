@@ -1,9 +1,12 @@
 """One tiny training whose every step is a checkpoint."""
 
+import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, Phase, settings
 from lerobot.scripts import lerobot_eval, lerobot_train  # noqa: F401  (in memory before patches are installed anew)
 from tests.builders import SMALL_POLICIES, write_dataset
 
@@ -13,6 +16,21 @@ lerobot_patches.install()  # what lerobot_eval has brought
 
 N_STEPS = 12
 """The steps of the training, 5 an epoch: 39 frames in batches of 8."""
+
+TIMES = int(os.environ.get("UCA_GENERATED_CASES", "1"))
+"""How many times as many cases to generate as in a run of all tests."""
+
+
+def generated(n_cases: int) -> Callable[[Callable], Callable]:
+    """Generate the same cases in each run; with UCA_GENERATED_CASES more, and others."""
+    return settings(
+        max_examples=n_cases * TIMES,
+        derandomize=TIMES == 1,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],  # shrinking takes minutes
+        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    )
 
 
 def train(*arguments: object) -> None:

@@ -5,11 +5,11 @@ from dataclasses import fields, replace
 from typing import get_args
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
-from tests.trust.conftest import train, training_options
+from tests.trust.conftest import generated, train, training_options
 
 from lerobot_uca.bounds import BOUNDS, check_bounds
 from lerobot_uca.data.collect import CollectConfig, collect
@@ -77,7 +77,7 @@ def invalid(draw, field):
 
 @pytest.mark.parametrize(("group", "config", "field"), NUMBERS, ids=lambda value: getattr(value, "name", None))
 def test_what_is_out_of_bounds_is_refused(group, config, field):
-    @settings(max_examples=12, derandomize=True, database=None, deadline=None)
+    @generated(12)
     @given(value=invalid(field))
     def refused(value):
         with pytest.raises(UserError, match=rf"^{group}\.{field.name} must be "):

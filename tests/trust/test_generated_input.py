@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lerobot.common.train_utils import load_training_state
 from lerobot.configs import PreTrainedConfig
@@ -18,23 +18,12 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
 from lerobot.policies import get_policy_class, make_pre_post_processors
 from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_batch, make_config
-from tests.trust.conftest import N_STEPS
+from tests.trust.conftest import N_STEPS, generated
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
-
-
-def generated(n_cases: int) -> Callable[[Callable], Callable]:
-    return settings(
-        max_examples=n_cases,
-        derandomize=True,
-        database=None,
-        deadline=None,
-        phases=[Phase.generate],  # shrinking takes minutes
-        suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-    )
 
 
 @pytest.fixture(scope="module")
