@@ -21,6 +21,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_
 
 
 N_RETRIES = 5  # of a cell whose node has died
+N_CLAIMS = 5  # tries to claim a cell, POLL_SECONDS and a process apart: a node's last processes may hold it for seconds
 MAX_MINUTES = 24 * 60  # of a cell on Slurm, unless the options say another time
 POLL_SECONDS = 0.5
 
@@ -86,7 +87,7 @@ def on_ray(address: str) -> Launcher:
 
     def launch(folder: Path, cells: Sequence[Cell], expert: str | None) -> Iterator[Ended]:
         needs_gpu = RunFolder.open(folder).setting.policy.get("device") != "cpu" and ray.cluster_resources().get("GPU")
-        remote = ray.remote(num_cpus=1, num_gpus=1 if needs_gpu else 0, max_retries=N_RETRIES)(run_process)
+        remote = ray.remote(num_cpus=1, num_gpus=1 if needs_gpu else 0, max_retries=N_RETRIES)(_claim_and_run)
         running = {remote.remote(folder, cell, expert): cell for cell in cells}
         while running:
             (done, *_), _ = ray.wait(list(running))
@@ -98,6 +99,16 @@ def on_ray(address: str) -> Launcher:
         ray.shutdown()
 
     return launch
+
+
+def _claim_and_run(folder: Path, cell: Cell, expert: str | None) -> int:
+    """As `run_process`, for a cell that may be claimed by what is left of a node that has died."""
+    for _ in range(N_CLAIMS):
+        returncode = run_process(folder, cell, expert)
+        if returncode != Outcome.CLAIMED:
+            break
+        time.sleep(POLL_SECONDS)
+    return returncode
 
 
 def _connect(ray: Any, address: str) -> None:
