@@ -22,6 +22,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_uca.protocol.record import provenance
 from lerobot_uca.robots.ur5e.sim.robot import HOME
 from lerobot_uca.robots.ur5e.sim.scene_service import SceneClient
 
@@ -63,7 +64,10 @@ SEED = 1000  # of training
 FIRST_TRIAL = 1000  # seed: places that no demonstration has seen
 MOVED = 0.02  # [rad]: a trial's time begins when the arm is so far from home
 FILM_RATE, FILM_SIZE = 15, (320, 240)  # [Hz], [pixels]
-COLUMNS = ("task", "method", "seed", "steps", "demonstrations", "points", "trial", "success", "seconds")
+COLUMNS = (
+    *("task", "method", "seed", "steps", "demonstrations", "points", "trial", "success", "seconds"),
+    *("command", "commit", "versions", "cpu"),
+)
 
 
 def main() -> None:
@@ -125,7 +129,7 @@ def run_task(name: str, task: Task, options: argparse.Namespace) -> list[str]:
                 success, lasted = attempt(rollout, scene, film=folder / f"{method}.mp4" if trial == 0 else None)
                 n_successes += success
                 row = (name, method, SEED, steps, options.demonstrations, task.n_points, trial, int(success), lasted)
-                add_row(options.output / "trials.csv", row)
+                add_row(options.output / "trials.csv", (*row, *origin()))
             lines.append(f"{name} {method}: {n_successes} of {options.trials} trials succeeded")
         scene.ask(request="reset", task=name, seed=0, with_arm=True)
         run(f"lerobot-replay {robot} {data} --dataset.episode=0 --play_sounds=false")
@@ -187,6 +191,19 @@ def write_film(file: Path, pictures: list[NDArray[np.uint8]]) -> None:
         for picture in pictures:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
+
+
+def origin() -> tuple[str, str, str, str]:
+    """The last columns of a row: how it was made."""
+    made = provenance()
+    versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
+    command = shlex.join(["python", "examples/ur5e_demo.py", *sys.argv[1:]])
+    return (
+        command,
+        made["commit"] or "unknown",
+        versions,
+        f"{made['hardware']['cpu']}, {made['hardware']['cores']} cores",
+    )
 
 
 def add_row(file: Path, row: tuple[object, ...]) -> None:
