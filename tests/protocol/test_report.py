@@ -5,10 +5,13 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
+from tests.browser import browser, needs_browser
+from tests.robots.conftest import wait_until
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, Cell
 from lerobot_uca.protocol.command import main
+from lerobot_uca.protocol.figures import COLOURS
 from lerobot_uca.protocol.folder import RunFolder, write_json
 from lerobot_uca.protocol.paper import ABLATION, COLUMNS, MILLISECONDS, SUCCESS
 from lerobot_uca.protocol.results import Results
@@ -163,6 +166,23 @@ def test_the_page_is_self_contained(folder, tmp_path):
     assert "<script" not in text
     for png in ("success_over_epochs", "success_and_latency", "success_by_task"):
         assert (tmp_path / "report" / f"{png}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@needs_browser
+def test_a_browser_shows_the_page(folder, tmp_path):
+    """Text, and the figures in the policies' colours."""
+    main(["report", str(folder.path), f"--output={tmp_path}/report", "--html"])
+    page = (tmp_path / "report" / "report.html").as_uri()
+    with browser(page, tmp_path / "user", (1000, 2400)) as picture:
+
+        def n_pixels(colour: str) -> int:
+            rgb = [int(colour[start : start + 2], 16) for start in (1, 3, 5)]
+            return int((picture() == rgb).all(axis=-1).sum())
+
+        wait_until(lambda: min(n_pixels(COLOURS[policy]) for policy in ("uca_flow", "adaln")) > 500, 120)
+        dark = picture().max(axis=-1) < 100
+    assert dark[:, :900].any(axis=1).mean() > 0.2  # lines of text from top to bottom
+    assert dark[-200:].any()
 
 
 def test_a_corrupt_row_is_named_and_the_rest_is_reported(folder, tmp_path, capsys):

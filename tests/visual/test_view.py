@@ -1,22 +1,14 @@
 """Looking at clouds."""
 
-import base64
-import json
-import os
-import shutil
-import signal
 import socket
-import subprocess
 import sys
 import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
-from pathlib import Path
+from contextlib import closing
 
-import cv2
 import numpy as np
 import pytest
 import yaml
+from tests.browser import browser, needs_browser
 from tests.depth_builders import CROP, live_frame, make_calibration, make_recipe, write_depth_dataset
 from tests.robots.conftest import wait_until
 
@@ -74,7 +66,6 @@ def test_a_picture_and_a_recording(depth_dataset, tmp_path, monkeypatch, capsys)
     assert recording.read_bytes().startswith(b"RRF")
 
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 WINDOW = (1100, 700)
 PANEL = 340
 """[pixels] The width of the page's right side, which holds its sliders and buttons."""
@@ -86,44 +77,13 @@ def free_port() -> int:
         return opened.getsockname()[1]
 
 
-@contextmanager
-def browser(url: str, folder: Path) -> Iterator[Callable[[], np.ndarray]]:
-    """A headless browser on a page, WebGL included; what it yields takes a picture of the page, (H, W, 3) uint8."""
-    import websockets.sync.client  # viser needs it
-
-    assert BROWSER is not None
-    command = [
-        *(BROWSER, "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-        *("--hide-scrollbars", "--no-first-run", "--disable-dev-shm-usage", f"--user-data-dir={folder}"),
-        *(f"--window-size={WINDOW[0]},{WINDOW[1]}", "--remote-debugging-port=0", url),
-    ]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
-        file = folder / "DevToolsActivePort"
-        wait_until(lambda: file.exists() and file.read_text().count("\n"), 120)
-        with urllib.request.urlopen(f"http://127.0.0.1:{file.read_text().split()[0]}/json/list") as opened:
-            (address,) = [each["webSocketDebuggerUrl"] for each in json.load(opened) if each["url"].startswith(url)]
-        with websockets.sync.client.connect(address, max_size=None) as devtools:
-
-            def picture() -> np.ndarray:
-                devtools.send(json.dumps({"id": 1, "method": "Page.captureScreenshot"}))
-                data = json.loads(devtools.recv(timeout=120))["result"]["data"]
-                return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-
-            yield picture
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)  # its helpers, too
-        process.wait()
-
-
 def n_pixels(picture: np.ndarray, colour: tuple[int, int, int]) -> int:
     """Pixels of about a colour beside the panel; the page lights its points, so that shades differ a little."""
     scene = picture[:, : -PANEL - 20].astype(int)
     return int((np.abs(scene - colour).max(axis=-1) < 30).sum())
 
 
-@pytest.mark.skipif(BROWSER is None, reason="there is no browser: chromium, chromium-browser or google-chrome")
+@needs_browser
 @pytest.mark.usefixtures("calibrated")
 def test_a_browser_shows_the_cloud(depth_dataset, tmp_path):
     """Blue points inside the crop and grey ones outside it, on the page as it is served; sliders turn blue to grey."""
@@ -132,7 +92,7 @@ def test_a_browser_shows_the_cloud(depth_dataset, tmp_path):
     with closing(view(config)) as pages:
         page = next(pages)
         try:
-            with browser(f"http://127.0.0.1:{page.server.get_port()}", tmp_path / "user") as picture:
+            with browser(f"http://127.0.0.1:{page.server.get_port()}", tmp_path / "user", WINDOW) as picture:
                 wait_until(lambda: min(n_pixels(picture(), colour) for colour in (INSIDE, OUTSIDE)) > 100, 120)
                 for slider in page._sliders[:3]:
                     slider.value = slider.max  # the crop holds nothing

@@ -108,7 +108,8 @@ def bars(results: Results, plt: Any) -> Any:
     if not tasks:
         return None
     height = 0.8 / len(results.policies)
-    figure, axis = plt.subplots(figsize=(6, 0.6 + 0.22 * len(tasks) * max(1, len(results.policies) / 2)))
+    size = (6, 1.1 + 0.22 * len(tasks) * max(1, len(results.policies) / 2))
+    figure, axis = plt.subplots(figsize=size, layout="constrained")
     for index, policy in enumerate(results.policies):
         for row, task in enumerate(tasks):
             estimate, printed = results.honest((task,), policy), of_task(task, policy)
@@ -124,7 +125,7 @@ def bars(results: Results, plt: Any) -> Any:
     axis.set_xlabel("success [%]; black: the paper's, where it prints one")
     handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[policy]) for policy in results.policies]
     titles = [POLICIES[policy].title for policy in results.policies]
-    figure.legend(handles, titles, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=4)
+    figure.legend(handles, titles, loc="outside lower center", ncols=4)
     return figure
 
 
