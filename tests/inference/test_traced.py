@@ -96,6 +96,13 @@ def test_bfloat16_rounds_but_computes_the_same():
     assert 1e-4 < error < 0.05
 
 
+def test_rounding_counts_against_the_range_of_actions_not_against_small_ones():
+    """As those of a policy that holds still: bfloat16 moves an action by 0.4 % of [-1, 1], and this one by 14 %."""
+    function = BFloat16Function(call)
+    assert function._is_close(torch.tensor([0.057]), torch.tensor([0.05]))
+    assert not function._is_close(torch.tensor([1.1]), torch.tensor([1.0]))
+
+
 @every_runtime
 def test_results_are_not_overwritten_by_the_next_call(runtime):
     network, function = make_network(), runtime(call)
