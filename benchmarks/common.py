@@ -1,11 +1,8 @@
 """Shared by the benchmarks: untrained policies, a timer, the machine's peaks, and rows that say how they were made."""
 
 import csv
-import importlib.metadata
 import os
-import platform
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
@@ -21,6 +18,7 @@ from torch import Tensor
 import lerobot_policy_uca_flow  # noqa: F401  (registers policies and environments)
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
+from lerobot_uca.protocol.record import COLUMNS, columns
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -29,7 +27,6 @@ CLOUD_POINTS, N_STATES, N_ACTIONS = 512, 9, 4
 SIZES: dict[str, dict[str, Any]] = {"small": {"dim": 128, "n_points": 128}, "full": {"dim": 256, "n_points": 512}}
 """UCA-Flow in the small configuration and at its default size."""
 OMP = "OMP_NUM_THREADS"
-VERSIONS_OF = ("lerobot", "torch", "openvino", "onnxruntime", "mujoco")
 
 
 def make_policy(policy_type: str = "uca_flow", cloud_points: int = CLOUD_POINTS, **settings: Any) -> PointCloudPolicy:
@@ -82,23 +79,13 @@ def reading_bandwidth(device: str = "cpu", n_megabytes: int = 256) -> float:
 
 # Provenance -------------------------------------------------------------------------------------------------------
 
-PROVENANCE = ("command", "commit", "versions", "cpu")
-"""Columns that every row of benchmarks/results/*.csv ends with."""
-
 
 def provenance() -> dict[str, str]:
-    """The command, the commit (+ if files differ from it), versions and the processor of this run."""
+    """How this run's rows were made: `COLUMNS`."""
     script = Path(sys.argv[0])
     name = script.resolve().relative_to(ROOT) if script.resolve().is_relative_to(ROOT) else Path(script.name)
-    installed = {distribution.metadata["Name"] for distribution in importlib.metadata.distributions()}
-    versions = [f"{each} {importlib.metadata.version(each)}" for each in VERSIONS_OF if each in installed]
     threads = [f"{OMP}={os.environ[OMP]}"] if OMP in os.environ else []
-    return {
-        "command": shlex.join([*threads, "python", str(name), *sys.argv[1:]]),
-        "commit": _commit(),
-        "versions": ", ".join([f"Python {platform.python_version()}", *versions]),
-        "cpu": f"{_processor()}, {os.cpu_count()} cores",
-    }
+    return columns(shlex.join([*threads, "python", str(name), *sys.argv[1:]]))
 
 
 def print_provenance() -> None:
@@ -113,7 +100,7 @@ def write_rows(rows: Iterable[dict[str, Any]], file: TextIO = sys.stdout) -> Non
     made, writer = provenance(), None
     for row in rows:
         if writer is None:
-            writer = csv.DictWriter(file, [*row, *PROVENANCE], lineterminator="\n")
+            writer = csv.DictWriter(file, [*row, *COLUMNS], lineterminator="\n")
             writer.writeheader()
         writer.writerow({**row, **made})
         file.flush()
@@ -125,17 +112,3 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return []
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def _commit() -> str:
-    git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty=+"]
-    result = subprocess.run(git, capture_output=True, text=True, check=False)
-    return result.stdout.strip() or "unknown"
-
-
-def _processor() -> str:
-    """The processor's name as Linux gives it; elsewhere what Python knows."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()

@@ -22,7 +22,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.protocol.record import provenance
+from lerobot_uca.protocol.record import columns
 from lerobot_uca.robots.ur5e.sim.robot import HOME
 from lerobot_uca.robots.ur5e.sim.scene_service import SceneClient
 
@@ -64,10 +64,7 @@ SEED = 1000  # of training
 FIRST_TRIAL = 1000  # seed: places that no demonstration has seen
 MOVED = 0.02  # [rad]: a trial's time begins when the arm is so far from home
 FILM_RATE, FILM_SIZE = 15, (320, 240)  # [Hz], [pixels]
-COLUMNS = (
-    *("task", "method", "seed", "steps", "demonstrations", "points", "trial", "success", "seconds"),
-    *("command", "commit", "versions", "cpu"),
-)
+COLUMNS = ("task", "method", "seed", "steps", "demonstrations", "points", "trial", "success", "seconds")
 
 
 def main() -> None:
@@ -129,7 +126,7 @@ def run_task(name: str, task: Task, options: argparse.Namespace) -> list[str]:
                 success, lasted = attempt(rollout, scene, film=folder / f"{method}.mp4" if trial == 0 else None)
                 n_successes += success
                 row = (name, method, SEED, steps, options.demonstrations, task.n_points, trial, int(success), lasted)
-                add_row(options.output / "trials.csv", (*row, *origin()))
+                add_row(options.output / "trials.csv", row)
             lines.append(f"{name} {method}: {n_successes} of {options.trials} trials succeeded")
         scene.ask(request="reset", task=name, seed=0, with_arm=True)
         run(f"lerobot-replay {robot} {data} --dataset.episode=0 --play_sounds=false")
@@ -193,25 +190,15 @@ def write_film(file: Path, pictures: list[NDArray[np.uint8]]) -> None:
         container.mux(stream.encode())
 
 
-def origin() -> tuple[str, str, str, str]:
-    """The last columns of a row: how it was made."""
-    made = provenance()
-    versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items())
-    command = shlex.join(["python", "examples/ur5e_demo.py", *sys.argv[1:]])
-    return (
-        command,
-        made["commit"] or "unknown",
-        versions,
-        f"{made['hardware']['cpu']}, {made['hardware']['cores']} cores",
-    )
-
-
 def add_row(file: Path, row: tuple[object, ...]) -> None:
-    """Append a row to a CSV."""
+    """Append a row to a CSV, with how it was made."""
+    made = columns(shlex.join(["python", "examples/ur5e_demo.py", *sys.argv[1:]]))
     is_new = not file.exists()
     with file.open("a", newline="", encoding="utf-8") as opened:
         writer = csv.writer(opened, lineterminator="\n")
-        writer.writerows([COLUMNS, row] if is_new else [row])
+        if is_new:
+            writer.writerow([*COLUMNS, *made])
+        writer.writerow([*row, *made.values()])
 
 
 def run(command: str, complete: Path | None = None, unfinished: Path | None = None) -> None:

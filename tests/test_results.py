@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_uca.protocol.record import COLUMNS
+
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 CSV_FILES = sorted((BENCHMARKS / "results").glob("*.csv"))
 TEXT_FILES = sorted((BENCHMARKS / "results").glob("*.txt"))
@@ -21,11 +23,11 @@ def common(monkeypatch):
 
 
 @pytest.mark.parametrize("path", CSV_FILES, ids=lambda path: path.name)
-def test_rows_end_with_their_provenance(path, common):
+def test_rows_end_with_their_provenance(path):
     with path.open(newline="") as file:
         rows = csv.DictReader(file)
-        assert tuple(rows.fieldnames[-4:]) == common.PROVENANCE
-        assert all(row[name] for row in rows for name in common.PROVENANCE)
+        assert tuple(rows.fieldnames[-4:]) == COLUMNS
+        assert all(row[name] for row in rows for name in COLUMNS)
 
 
 @pytest.mark.parametrize("path", TEXT_FILES, ids=lambda path: path.name)

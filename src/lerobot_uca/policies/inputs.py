@@ -20,6 +20,9 @@ LARGEST = 1e6
 """Normalised values lie near [-1, 1]. From about 1e19 on their squares are infinite: PyTorch then computes NaN, other
 runtimes arbitrary actions."""
 
+SQUARES_ARE_FINITE = 1e18
+"""So large that no action reaches it, and so small that float32 holds the sum of its squares."""
+
 SUMMED_AT_ONCE = 10_000
 """Of more values BLAS wakes threads of its own, which then spin on a core that the network needs."""
 
@@ -112,7 +115,7 @@ def check_values(name: str, value: Tensor) -> None:
 
 def is_finite(values: Tensor) -> bool:
     """Whether all values are finite."""
-    return _lie_within(values, 1e18) or bool(torch.isfinite(values).all())
+    return _lie_within(values, SQUARES_ARE_FINITE) or bool(torch.isfinite(values).all())
 
 
 def _lie_within(value: Tensor, largest: float) -> bool:

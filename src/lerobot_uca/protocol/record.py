@@ -7,7 +7,12 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("lerobot", "lerobot_policy_uca_flow", "torch", "numpy", "mujoco", "metaworld", "gymnasium-robotics")
+PACKAGES = (
+    *("lerobot", "lerobot_policy_uca_flow", "torch", "openvino", "onnxruntime"),
+    *("numpy", "mujoco", "metaworld", "gymnasium-robotics"),
+)
+COLUMNS = ("command", "commit", "versions", "cpu")
+"""The last columns of a measured row."""
 
 
 def provenance() -> dict[str, Any]:
@@ -23,6 +28,22 @@ def provenance() -> dict[str, Any]:
             "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
             "threads": torch.get_num_threads(),
         },
+    }
+
+
+def columns(command: str) -> dict[str, str]:
+    """The same as a row's last columns, `COLUMNS`.
+
+    Args:
+        command: what was typed.
+    """
+    made = provenance()
+    hardware, versions = made["hardware"], made["versions"].items()
+    return {
+        "command": command,
+        "commit": made["commit"] or "unknown",
+        "versions": ", ".join(f"{name} {version}" for name, version in versions if version),
+        "cpu": f"{hardware['cpu']}, {hardware['cores']} cores",
     }
 
 

@@ -12,8 +12,8 @@ from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import DepthError, DepthToCloud
 from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import calibration_of, installed_calibrations
+from lerobot_uca.robots.camera_check import check_cameras
 from lerobot_uca.robots.realsense import connect
-from lerobot_uca.robots.ur5e.camera_check import check_cameras
 
 
 def live_clouds(

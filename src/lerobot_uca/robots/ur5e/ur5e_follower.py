@@ -14,8 +14,8 @@ from lerobot.robots import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.robots.camera_check import check_cameras
 from lerobot_uca.robots.realsense import connect
-from lerobot_uca.robots.ur5e.camera_check import check_cameras
 from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Settings, State, Target
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
 from lerobot_uca.robots.ur5e.dashboard import check_controller

@@ -10,7 +10,7 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 from numpy.typing import NDArray
 
 from lerobot_uca.point_clouds.depth import MILLIMETRE
-from lerobot_uca.robots.ur5e.depth_device import DepthDevice
+from lerobot_uca.robots.depth_device import DepthDevice
 from lerobot_uca.robots.ur5e.sim.config_simulated_camera import SimulatedCameraConfig
 from lerobot_uca.robots.ur5e.sim.scene_service import SERIAL, SceneClient, simulated_camera
 

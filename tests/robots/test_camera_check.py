@@ -15,8 +15,8 @@ from lerobot.cameras.configs import Cv2Rotation
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import Calibration
 from lerobot_uca.point_clouds.geometry import Camera, as_pose
-from lerobot_uca.robots.ur5e.camera_check import check_cameras
-from lerobot_uca.robots.ur5e.depth_device import DepthDevice, depth_device
+from lerobot_uca.robots.camera_check import check_cameras
+from lerobot_uca.robots.depth_device import DepthDevice, depth_device
 
 rs = pytest.importorskip("pyrealsense2", reason="the extra realsense is not installed")
 

@@ -7,7 +7,7 @@ from typing import Any
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import Calibration, CalibrationError
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, installed_calibrations
-from lerobot_uca.robots.ur5e.depth_device import DepthDevice, depth_device
+from lerobot_uca.robots.depth_device import DepthDevice, depth_device
 
 FOCAL_TOLERANCE = 0.02
 """A focal length's largest difference from the calibrated one: boards find it within 1 %, other streams and image sizes
