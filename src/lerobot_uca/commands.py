@@ -71,8 +71,10 @@ def saliency() -> None:
 def view() -> None:
     """`lerobot-uca-view`."""
     _begin()
+    from lerobot_uca.robots.realsense import register
     from lerobot_uca.visual.view import run
 
+    register()
     run()
 
 

@@ -18,7 +18,9 @@ from lerobot_uca.point_clouds.geometry import Camera, as_pose
 from lerobot_uca.robots.camera_check import check_cameras
 from lerobot_uca.robots.depth_device import DepthDevice, depth_device
 
-rs = pytest.importorskip("pyrealsense2", reason="the extra realsense is not installed")
+rs = pytest.importorskip(
+    "pyrealsense2", reason="the extra realsense or the system's libusb is not installed", exc_type=ImportError
+)
 
 SERIAL, UNIT = "123456", 0.00025
 FACTORY = DepthDevice(SERIAL, 640, 480, fx=385.0, fy=386.5, cx=322.0, cy=238.0, depth_unit=UNIT)

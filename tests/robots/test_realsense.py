@@ -1,10 +1,12 @@
 """A camera that librealsense dropped is named where it fails to open."""
 
+import sys
+
 import pytest
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.robots import realsense
-from lerobot_uca.robots.realsense import connect, dropped_camera
+from lerobot_uca.robots.realsense import connect, dropped_camera, register
 
 
 def plug_in(folder, vendor, product):
@@ -34,3 +36,11 @@ def test_other_failures_are_the_cameras_own(tmp_path, monkeypatch, device):
     monkeypatch.setattr(realsense, "USB_DEVICES", tmp_path)
     with pytest.raises(ConnectionError, match="Failed to open"):
         connect("front", AbsentCamera())
+
+
+def test_a_librealsense_that_does_not_load_is_said_in_a_line(monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, "lerobot.cameras.realsense", None)  # so its import fails
+    register()
+    (record,) = caplog.records
+    assert "librealsense does not load" in record.message
+    assert "apt install libusb-1.0-0" in record.message

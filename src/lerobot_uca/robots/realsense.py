@@ -1,6 +1,8 @@
-"""Connecting cameras, with a line about a RealSense camera that librealsense no longer knows."""
+"""RealSense cameras: registered where librealsense loads, and a line about those that it no longer knows."""
 
+import importlib
 import importlib.metadata
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,24 @@ L515_PRODUCTS = ("0b0d", "0b3d", "0b64")
 """USB product numbers of the L500 family, of which the L515 was sold."""
 DROPPED_BY = "2.55.1"
 """The first release of librealsense without the L500 family, and the one that LeRobot needs."""
+
+logger = logging.getLogger(__name__)
+
+
+def register() -> None:
+    """Let LeRobot register --camera.type=intelrealsense, or say what keeps librealsense from loading.
+
+    Its wheel does not bring a library of the system that it needs. LeRobot's own commands for robots import it as soon
+    as it is installed, before any plugin, and end in Python's error.
+    """
+    try:
+        importlib.import_module("lerobot.cameras.realsense")
+    except ImportError as error:
+        logger.warning(
+            "RealSense cameras cannot be used, since librealsense does not load: %s. On Debian: "
+            "apt install libusb-1.0-0",
+            error,
+        )
 
 
 def connect(name: str, camera: Any) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from lerobot.cameras import CameraConfig
-from lerobot.cameras.realsense import RealSenseCameraConfig  # noqa: F401 (registers --camera.type=intelrealsense)
 from lerobot.configs import parser
 from lerobot.envs.configs import EnvConfig
 from numpy.typing import NDArray
