@@ -124,6 +124,20 @@ def test_the_wheels_readme_has_no_links_into_the_repository(wheel):
     assert "meanflow.py" in text
 
 
+def test_with_an_address_every_link_of_the_readme_is_absolute_and_leads_to_a_file(monkeypatch):
+    monkeypatch.syspath_prepend(SOURCE.parent.parent)
+    from hatch_build import without_relative_links
+
+    repository = "https://example.com/uca-flow"
+    readme = (SOURCE.parent.parent / "README.md").read_text()
+    links = re.findall(r"\]\(([^)]*)\)", without_relative_links(readme, repository))
+    assert len(links) == len(re.findall(r"\]\(", readme))
+    assert all(link.startswith("https://") for link in links)
+    ours = [link.removeprefix(f"{repository}/").split("/", 2) for link in links if link.startswith(repository)]
+    assert {"blob", "raw"} == {kind for kind, _, _ in ours}
+    assert all((SOURCE.parent.parent / path.partition("#")[0]).exists() for _, _, path in ours)
+
+
 def test_an_installed_wheel_runs_from_any_folder(wheel_file, tmp_path):
     """Into an environment that has the dependencies of this one, without pip's copying of gigabytes."""
     venv.create(tmp_path / "venv", with_pip=False)
