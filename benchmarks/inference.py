@@ -63,7 +63,7 @@ def measure(policy: PointCloudPolicy, batch_size: int, n_calls: int, peak: float
     """The numbers of a row, in the order of MEASURED."""
     config, device = policy.config, policy.config.device
     observation = make_observation(batch_size, device=device)
-    frame = (observation[OBS_POINT_CLOUD][:, None, : config.n_points], observation["observation.state"][:, None])
+    frame = (observation[OBS_POINT_CLOUD][:, : config.n_points], observation["observation.state"])
     noise = torch.randn(batch_size, config.horizon, config.n_actions, device=device)
     o = torch.randn(batch_size, config.n_obs_steps, config.n_obs_features, device=device)
     encoder, generator = policy.ema_model.encoder, policy.ema_model.generator
@@ -73,14 +73,14 @@ def measure(policy: PointCloudPolicy, batch_size: int, n_calls: int, peak: float
 
     generate = make_backend(config.inference)(generate_one)
     milliseconds = (
-        times(lambda: policy._encode_frames(encoder, *frame), n_calls, device),
+        times(lambda: policy._encode_frame(encoder, *frame), n_calls, device),
         times(lambda: generate(generator, noise, o), n_calls, device),
         times(lambda: policy.predict_action_chunk(observation), n_calls, device),
     )
     floors = [
         1e3 * max(flops(function) / peak, n_bytes(network) / bandwidth)
         for function, network in (
-            (lambda: encoder(*frame), encoder),
+            (lambda: encoder(*(each[:, None] for each in frame)), encoder),
             (lambda: policy.generate(generator, noise, o), generator),
         )
     ]

@@ -16,7 +16,7 @@ sizes = pytest.mark.parametrize(
 
 
 def make_frame(step: int) -> Frame:
-    return Frame(torch.full((2, 1, 4, 3), step), torch.full((2, 1, 5), step))
+    return Frame(torch.full((2, 4, 3), step), torch.full((2, 5), step))
 
 
 @sizes
@@ -28,7 +28,7 @@ def test_a_plan_sees_every_stride_th_frame_and_the_first_one_stands_for_those_be
     assert history.batch_size is None
     for now in range(12):
         history.append(make_frame(now))
-        steps = [int(frame.state[0, 0, 0]) for frame in history.observed]
+        steps = [int(frame.state[0, 0]) for frame in history.observed]
         assert steps == [max(0, now - (n_obs_steps - 1 - i) * stride) for i in range(n_obs_steps)]
     assert history.batch_size == 2
 

@@ -13,8 +13,6 @@ import warnings
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from itertools import compress
-from operator import attrgetter
 from textwrap import shorten
 from typing import ClassVar
 
@@ -30,9 +28,6 @@ WEIGHTS_PER_THREAD = 900_000
 """A second thread pays from about twice so many weights, those of all samples of a batch counted together."""
 MAX_TRACES = 4
 """Traces of a function, for the shapes used last: each one holds 10 to 20 MB and threads of its own."""
-
-VERSION = attrgetter("_version")
-"""Counts a tensor's changes in place."""
 
 _exporter = threading.Lock()
 """PyTorch's exporter keeps its state in globals."""
@@ -131,23 +126,21 @@ class _Weights:
 
     def __init__(self, network: nn.Module) -> None:
         self._owners = [module._parameters for module in network.modules() if module._parameters]
-        weights = self._weights()
-        # Weights made in inference mode count no changes: nothing trains them.
-        self._counts_changes = [not weight.is_inference() for weight in weights]
-        self._addresses = list(map(Tensor.data_ptr, weights))
-        self._changes = self._count_changes(weights)
-        self._kept = [weight.detach() for weight in weights]  # while a storage is kept, no other one has its address
+        self._seen = self._look()
+        # While a storage is kept, no other one has its address.
+        self._kept = [weight.detach() for owner in self._owners for weight in owner.values() if weight is not None]
 
     def have_changed(self) -> bool:
         """Whether any weight is not what it was."""
-        weights = self._weights()  # below, `map` takes a third of a loop's time
-        return list(map(Tensor.data_ptr, weights)) != self._addresses or self._count_changes(weights) != self._changes
+        return self._look() != self._seen
 
-    def _weights(self) -> list[nn.Parameter]:
-        return [weight for owner in self._owners for weight in owner.values() if weight is not None]
-
-    def _count_changes(self, weights: list[nn.Parameter]) -> list[int]:
-        return list(map(VERSION, compress(weights, self._counts_changes)))
+    def _look(self) -> list[tuple[int, int]]:
+        """Address and changes in place of each weight; in one pass, since the cache holds none of them by now."""
+        weights = [weight for owner in self._owners for weight in owner.values() if weight is not None]
+        try:
+            return [(weight.data_ptr(), weight._version) for weight in weights]
+        except RuntimeError:  # weights made in inference mode count no changes: nothing trains them
+            return [(weight.data_ptr(), 0 if weight.is_inference() else weight._version) for weight in weights]
 
 
 def to_onnx(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 @dataclass
 class Frame:
-    """One step's point cloud (B, 1, N, 3), its state (B, 1, S) and, once a plan needs them, its features (B, 1, F)."""
+    """One step's point cloud (B, N, 3), its state (B, S) and, once a plan needs them, its features (B, 1, F)."""
 
     cloud: Tensor
     state: Tensor
@@ -43,7 +43,7 @@ class ObservationHistory:
     @property
     def batch_size(self) -> int | None:
         """B, or None before the first frame."""
-        return len(self._frames[-1].state) if self._frames else None
+        return self._frames[-1].state.shape[0] if self._frames else None
 
     def is_seen_again(self, n_steps: int, period: int) -> bool:
         """Whether the newest frame is seen by a plan made in n_steps, or by one of those every period steps later."""

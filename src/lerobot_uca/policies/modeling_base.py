@@ -95,7 +95,7 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         self.ema_model = deepcopy(self.model).requires_grad_(False)
         self.register_buffer("ema_step", torch.zeros((), dtype=torch.long))
         computed = make_backend(config.inference)
-        self._encode_frames = computed(_encode_frames)
+        self._encode_frame = computed(_encode_frame)
         self._plan = computed(self._encode_and_generate)
         self.reset()
 
@@ -198,7 +198,7 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
             self._remember(batch)
             return self._plan_from(self._history.observed, noise)
         cloud, state = self._read(batch, self.config.n_obs_steps).checked()
-        pairs = zip(cloud.split(1, dim=1), state.split(1, dim=1), strict=True)
+        pairs = zip(cloud.unbind(dim=1), state.unbind(dim=1), strict=True)
         return self._plan_from([Frame(*pair) for pair in pairs], noise)
 
     @property
@@ -211,22 +211,22 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
 
     def _remember(self, batch: Mapping[str, Tensor]) -> Frame:
         cloud, state = self._read(batch, None).checked()
-        if self._history.batch_size not in (None, len(state)):
+        if self._history.batch_size not in (None, state.shape[0]):
             raise UserError(
                 f"The batch must have {self._history.batch_size} samples, as since the last reset(), got {len(state)}."
             )
-        frame = Frame(cloud.unsqueeze(1), state.unsqueeze(1))
+        frame = Frame(cloud, state)
         self._history.append(frame)
         return frame
 
     def _features(self, frame: Frame) -> Tensor:
         if frame.features is None:
-            (frame.features,) = self._encode_frames(self.active_model.encoder, frame.cloud, frame.state)
+            (frame.features,) = self._encode_frame(self.active_model.encoder, frame.cloud, frame.state)
         return frame.features
 
     def _plan_from(self, observed: Sequence[Frame], noise: Tensor | None) -> Tensor:
         *earlier, newest = observed
-        shape = (len(newest.state), self.config.horizon, self.config.n_actions)
+        shape = (newest.state.shape[0], self.config.horizon, self.config.n_actions)
         if noise is None:
             noise = torch.randn(shape, device=newest.state.device)
         else:
@@ -247,7 +247,7 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
 
         One function, because between two a CPU loses as much time as a tenth of a small network takes.
         """
-        newest = model.encoder(cloud, state)
+        (newest,) = _encode_frame(model.encoder, cloud, state)
         actions = self.generate(model.generator, noise, torch.cat([*earlier, newest], dim=1))
         return actions[:, self.config.executed], newest
 
@@ -281,5 +281,5 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
             ) from error
 
 
-def _encode_frames(encoder: nn.Module, cloud: Tensor, state: Tensor) -> tuple[Tensor]:
-    return (encoder(cloud, state),)
+def _encode_frame(encoder: nn.Module, cloud: Tensor, state: Tensor) -> tuple[Tensor]:
+    return (encoder(cloud.unsqueeze(1), state.unsqueeze(1)),)
