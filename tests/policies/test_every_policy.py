@@ -170,7 +170,7 @@ def test_wrong_settings(name, changes, message):
 def test_a_policy_of_one_network_call_compiles_as_one_function(variant):
     policy = make(variant).eval()
     config, observation = policy.config, make_observation()
-    frame = (observation["observation.point_cloud"][:, None], observation["observation.state"][:, None])
+    frame = (observation["observation.point_cloud"], observation["observation.state"])
     inputs = (
         policy.ema_model,
         *frame,

