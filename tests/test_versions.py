@@ -59,7 +59,7 @@ def all_requirements() -> list[tuple[str, Requirement]]:
 
 
 def test_constraints_pin_every_dependency_inside_its_range():
-    """So an audit of constraints.txt (`make audit`) is one of all that `make` installs."""
+    """So an audit of constraints.txt (audit.py) is one of all that `make` installs."""
     for asker, requirement in all_requirements():
         name = canonicalize_name(requirement.name)
         if name == canonicalize_name(PROJECT):
