@@ -40,6 +40,7 @@ def guided_meanflow_losses(
     e = torch.randn_like(x)
     z = (1 - t[:, None, None]) * x + t[:, None, None] * e
     target = guided_target(network, z, t, t - h, o, v=e - x, n_instants=n)
+    torch.clear_autocast_cache()  # of weights converted without a graph: PyTorch 2.7 would take them below, untrained
     u, levels = network(z, t, t - h, o)
     error = mean_square(u - target, mask)
     dispersive = torch.stack([dispersive_loss(features) for features in levels[:N_DISPERSED_LEVELS]]).sum()
