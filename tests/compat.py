@@ -44,8 +44,8 @@ def highest(requirement: Requirement) -> str:
     return f"{requirement.name}{requirement.specifier}"
 
 
-def run_core(name: str, requirements: list[str]) -> int:
-    """Install the requirements and run the core. Returns pytest's exit code."""
+def run_core(name: str, requirements: list[str]) -> str:
+    """Install the requirements, run the core, and say how it ended and with which versions."""
     folder = ROOT / ".compat" / name
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
@@ -54,15 +54,20 @@ def run_core(name: str, requirements: list[str]) -> int:
     (site / "shared.pth").write_text("\n".join([*shared, str(ROOT / "src")]) + "\n")
     print(f"== {name}: {' '.join(requirements)}", flush=True)
     subprocess.run([python, "-m", "pip", "install", "--quiet", "--upgrade", *requirements], check=True)
-    tests = [ROOT / "tests" / path for path in CORE]
-    return subprocess.run([python, "-m", "pytest", "-p", "no:cacheprovider", *tests], cwd=ROOT, check=False).returncode
+    command = [python, "-m", "pytest", "-p", "no:cacheprovider", *(ROOT / "tests" / path for path in CORE)]
+    returncode = subprocess.run(command, cwd=ROOT, check=False).returncode
+    names = [Requirement(each).name for each in requirements]
+    code = f"import importlib.metadata as m; print(', '.join(f'{{n}} {{m.version(n)}}' for n in {names}))"
+    versions = subprocess.run([python, "-c", code], check=True, capture_output=True, text=True).stdout.strip()
+    return f"{name}: {f'FAILED (exit code {returncode})' if returncode else 'passed'} with {versions}"
 
 
 def main() -> None:
     """Run both; exit with 1 if a test fails."""
     requirements = declared()
-    codes = [run_core(each.__name__, list(map(each, requirements))) for each in (lowest, highest)]
-    sys.exit(any(codes))
+    ends = [run_core(each.__name__, list(map(each, requirements))) for each in (lowest, highest)]
+    print(*ends, sep="\n")
+    sys.exit(any("FAILED" in end for end in ends))
 
 
 if __name__ == "__main__":
