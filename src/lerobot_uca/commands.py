@@ -95,6 +95,7 @@ def benchmark() -> None:
 
 def ur5e_sim() -> None:
     """`lerobot-uca-ur5e-sim`."""
+    end_by_signals()
     from lerobot_uca.errors import UserError
     from lerobot_uca.robots.ur5e.sim.command import main
 

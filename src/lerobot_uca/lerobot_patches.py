@@ -27,6 +27,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from tqdm import tqdm
 
 from lerobot_uca import configs
+from lerobot_uca.checkpoints.only_run import keep_others_out
 from lerobot_uca.checkpoints.resuming import cycle_exactly, without_trace
 from lerobot_uca.checkpoints.saving import save_whole, update_last
 from lerobot_uca.checkpoints.steps import check_steps
@@ -254,9 +255,9 @@ def report_failed_uploads() -> None:
 
 
 def check_settings() -> None:
-    """A folder that cannot be written is refused at once, wrong settings in one line.
+    """A folder that cannot be written, or that another training writes, is refused at once, wrong settings in one line.
 
-    LeRobot finds the first out at the first checkpoint or video, and shows a traceback for the second.
+    LeRobot finds the first out at the first checkpoint or video, the second never, and shows a traceback for the third.
     """
 
     def validated(validate: Callable[..., None]) -> Callable[..., None]:
@@ -271,6 +272,7 @@ def check_settings() -> None:
                 self.policy.validate_sizes()  # before the dataset is read: a horizon of 10^9 would fill the memory
                 if not self.job.is_remote:
                     check_output_folder(self.output_dir)
+                    keep_others_out(Path(self.output_dir))
 
         return validate_and_check
 

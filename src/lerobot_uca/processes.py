@@ -32,6 +32,8 @@ def _end(number: int, _: FrameType | None) -> None:
     _received.append(number)
     # A print could fail: the signal may have come while something was being printed.
     os.write(2, f"\nended by {signal.Signals(number).name}\n".encode())
+    for worker in multiprocessing.active_children():
+        worker.kill()  # before its pipe is closed, at which an environment's worker prints a traceback
     raise SystemExit(128 + number)
 
 

@@ -3,6 +3,8 @@
 import errno
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -91,6 +93,27 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_says_how_to_go_on(trained,
     monkeypatch.undo()
     train(*command.split()[1:])
     assert (checkpoints / "last").resolve().name == f"{N_STEPS:06d}"
+
+
+def test_a_second_training_into_the_folder_is_refused_until_the_first_has_ended(trained, tmp_path):
+    """Also before the first checkpoint, from which on LeRobot refuses it."""
+    code = (
+        "import lerobot_policy_uca_flow\n"
+        "from pathlib import Path\n"
+        "from lerobot_uca.checkpoints.only_run import keep_others_out\n"
+        f"keep_others_out(Path({str(tmp_path / 'run')!r}))\n"
+        "print('held', flush=True)\n"
+        "input()"
+    )
+    first = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert first.stdout.readline() == "held\n"
+    second = training_options(trained.parent / "data", tmp_path / "run")
+    with pytest.raises(UserError, match=r"Another run is writing '.*run'\. Wait until it has ended"):
+        train(*second)
+    first.kill()
+    first.wait()
+    train(*second, "--steps=1")
+    assert (tmp_path / "run" / "checkpoints" / "last").exists()
 
 
 def test_an_evaluation_does_not_change_the_training_that_follows():

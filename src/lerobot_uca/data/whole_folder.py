@@ -36,7 +36,7 @@ def whole_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
     try:
         _check_absent(folder, overwrite)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        with _only_writer(folder):
+        with only_writer(folder):
             _tidy_up(folder)
             _check_absent(folder, overwrite)  # another run may have just finished
             prefix = f".{folder.name}.unfinished-"
@@ -54,8 +54,12 @@ def _check_absent(folder: Path, overwrite: bool) -> None:
 
 
 @contextmanager
-def _only_writer(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system takes back when the process ends, however that is."""
+def only_writer(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock, which the system takes back when the process ends, however that is.
+
+    Raises:
+        UserError: if another process holds it.
+    """
     lock = FileLock(folder.with_name(f".{folder.name}.lock"), blocking=False)
     try:
         lock.acquire()

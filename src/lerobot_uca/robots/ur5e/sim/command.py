@@ -85,7 +85,4 @@ def main() -> None:
         )
         if options.fault != "none":
             threading.Timer(options.after, world.service.fault, [options.fault]).start()
-        try:
-            threading.Event().wait()
-        except KeyboardInterrupt:
-            logger.info("The simulated UR5e is switched off.")
+        threading.Event().wait()
