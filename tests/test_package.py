@@ -25,7 +25,7 @@ ALLOWED = {
         *("bounds", "meanflow", "objectives", "networks", "inference", "point_clouds"),
         *("errors", "features", "hub", "registry"),
     },
-    "envs": {"bounds", "point_clouds", "errors", "features", "registry"},
+    "envs": {"bounds", "point_clouds", "errors", "features", "registry", "processes"},
     "data": {"bounds", "envs", "point_clouds", "errors", "features", "hub", "processes"},
     "robots": {"point_clouds", "errors", "features", "registry", "processes"},
     "visual": {"bounds", "policies", "data", "envs", "robots", "point_clouds", "errors", "features"},

@@ -1,6 +1,5 @@
 """Commands end by signals in one line, and their workers end with them, whatever ended them."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -9,6 +8,8 @@ from multiprocessing.connection import Listener, wait
 from pathlib import Path
 
 import pytest
+
+from lerobot_uca.processes import worker_pool
 
 COMMAND = """
 import sys, time
@@ -55,14 +56,20 @@ def test_a_signal_that_is_ignored_stays_ignored():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_a_signal_while_workers_are_started_comes_when_they_know_what_to_do():
+    code = (
+        "import os, signal\n"
+        "from lerobot_uca.processes import end_by_signals, signals_put_off; end_by_signals()\n"
+        "with signals_put_off():\n    os.kill(os.getpid(), signal.SIGTERM); print('started', flush=True)\n"
+        "print('not reached')"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr.strip()) == (143, "started\n", "ended by SIGTERM")
+
+
 def pool_of_workers(address: str) -> None:
     """A parent with two idle workers, each of which holds a connection to the test as long as it lives."""
-    from concurrent.futures import ProcessPoolExecutor
-
-    from lerobot_uca.processes import end_with_parent
-
-    context = multiprocessing.get_context("forkserver")
-    with ProcessPoolExecutor(2, mp_context=context, initializer=end_with_parent) as pool:
+    with worker_pool(2) as pool:
         list(pool.map(connect, [address] * 2))
         signal.pause()
 

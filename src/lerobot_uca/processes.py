@@ -6,8 +6,13 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from types import FrameType, TracebackType
+from weakref import WeakSet
 
 
 def end_by_signals() -> None:
@@ -17,6 +22,8 @@ def end_by_signals() -> None:
     main thread. A signal that something else handles already, or that is ignored (nohup), stays as it is.
     """
     _report_interruption()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
@@ -26,14 +33,31 @@ def end_by_signals() -> None:
 _received: list[int] = []
 """The signal that ends this command. A library may swallow the exception, called back from C, and raise another."""
 
+_expendable: WeakSet[BaseProcess] = WeakSet()
+
+
+def kill_at_the_end(workers: Iterable[BaseProcess]) -> None:
+    """Kill these workers as soon as a signal ends this command: before their pipes close, at which they complain."""
+    _expendable.update(workers)
+
+
+def _kill_workers() -> None:
+    for worker in _expendable:
+        with suppress(ValueError):  # it was closed
+            worker.kill()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _kill_workers()
+    signal.default_int_handler(number, frame)
+
 
 def _end(number: int, _: FrameType | None) -> None:
     signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
     _received.append(number)
     # A print could fail: the signal may have come while something was being printed.
     os.write(2, f"\nended by {signal.Signals(number).name}\n".encode())
-    for worker in multiprocessing.active_children():
-        worker.kill()  # before its pipe is closed, at which an environment's worker prints a traceback
+    _kill_workers()
     raise SystemExit(128 + number)
 
 
@@ -56,11 +80,51 @@ def _report_interruption() -> None:
     sys.excepthook = hook
 
 
-def end_with_parent() -> None:
+@contextmanager
+def signals_put_off() -> Iterator[None]:
+    """Let signals wait until the block ends, in which workers are started.
+
+    A worker whose parent leaves before it has been told what to do ends in a traceback.
+    """
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
+        yield
+        return
+    received: list[int] = []
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    handlers = {number: signal.getsignal(number) for number in numbers}
+    for number in numbers:
+        signal.signal(number, lambda number, _: received.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler or signal.SIG_DFL)  # None: not Python's
+        for number in received:
+            signal.raise_signal(number)
+
+
+@contextmanager
+def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of worker processes. When it is left, what they are doing is finished, and what waits is dropped.
+
+    They end with this process, however that ends.
+    """
+    context = multiprocessing.get_context("forkserver")
+    pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=_end_with_parent)
+    try:
+        with signals_put_off():
+            for _ in range(n_workers):
+                pool.submit(os.getpid)  # which starts a worker, as none is idle yet
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
     """Let this worker process end as soon as its parent has ended, however that was: also by SIGKILL.
 
-    Give it to a pool as its initializer: a pool's idle workers would wait for good, as they hold the pipe open that
-    they read from. Ctrl-C, which a terminal sends to all processes, is left to the parent.
+    A pool's idle workers would wait for good, as they hold the pipe open that they read from. Ctrl-C, which a terminal
+    sends to all processes, is left to the parent.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

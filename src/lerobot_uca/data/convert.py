@@ -6,9 +6,7 @@ Example:
 
 import importlib.metadata
 import logging
-import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,6 +34,7 @@ from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import MIN_SHARE
 from lerobot_uca.point_clouds.geometry import sample_farthest
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO, make_crop
+from lerobot_uca.processes import worker_pool
 
 logger = logging.getLogger(__name__)
 
@@ -203,12 +202,8 @@ def _converted(config: ConvertConfig, source: Source, episodes: list[int]) -> It
     if config.num_workers == 0:
         yield from bar(map(convert_one, episodes))
         return
-    context = multiprocessing.get_context("forkserver")
-    with ProcessPoolExecutor(config.num_workers, mp_context=context) as pool:
-        try:
-            yield from bar(pool.map(convert_one, episodes))
-        finally:
-            pool.shutdown(cancel_futures=True)
+    with worker_pool(config.num_workers) as pool:
+        yield from bar(pool.map(convert_one, episodes))
 
 
 def _add(dataset: LeRobotDataset, episode: Episode) -> None:

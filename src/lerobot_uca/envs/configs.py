@@ -24,6 +24,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.calibration import Calibration
 from lerobot_uca.point_clouds.geometry import Camera, Crop
 from lerobot_uca.point_clouds.recipe import SIMULATED, CloudRecipe, DepthSource
+from lerobot_uca.processes import kill_at_the_end, signals_put_off
 from lerobot_uca.registry import register
 
 
@@ -139,8 +140,19 @@ class PointCloudEnvConfig(EnvConfig):
 def _vectorize(make: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -> gym.vector.VectorEnv:
     # LeRobot waits for the slowest of a batch; an environment that has finished must not go on simulating.
     if use_async_envs and n_envs > 1:
-        return _LazyAsyncVectorEnv([make] * n_envs)  # freezes by itself
+        return _AsyncVectorEnv([make] * n_envs)  # freezes by itself
     return gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs)
+
+
+class _AsyncVectorEnv(_LazyAsyncVectorEnv):
+    """LeRobot's, whose workers do not complain when a signal ends the command."""
+
+    def _ensure(self) -> None:
+        if self._env is None:
+            with signals_put_off():
+                super()._ensure()
+            env: Any = self._env
+            kill_at_the_end(env.processes)
 
 
 @register(EnvConfig, "metaworld_pointcloud")

@@ -5,9 +5,7 @@ Without clouds, which no expert looks at: an episode takes as long as its simula
 
 import csv
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from itertools import islice
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +18,7 @@ from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt, smoothed
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
-from lerobot_uca.processes import end_with_parent
+from lerobot_uca.processes import worker_pool
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.launchers import n_cores
 
@@ -98,7 +96,7 @@ def try_once(make_env: Callable[[], PointCloudEnv], attempt: Attempt) -> Trial:
 
 
 def _trials(make_env: Callable[[], PointCloudEnv], attempts: Iterator[Attempt]) -> Iterator[Trial]:
-    with ProcessPoolExecutor(n_cores(), mp_context=get_context("forkserver"), initializer=end_with_parent) as pool:
+    with worker_pool(n_cores()) as pool:
         pending = [pool.submit(try_once, make_env, attempt) for attempt in attempts]
         for future in pending:
             yield future.result()
