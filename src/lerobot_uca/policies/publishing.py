@@ -12,6 +12,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, OBS_S
 
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.hub import upload_command, uploading
+from lerobot_uca.point_clouds.recipe import CloudRecipe
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 
 if TYPE_CHECKING:
@@ -77,6 +78,7 @@ class PublishedPolicy:
             _what_it_is(self.config),
             _results(self.evaluation, cfg, latency_ms(self)),  # type: ignore[arg-type]
             _features(self.config, dataset_meta),
+            _clouds(self.config),
             _data(dataset_repo_id, dataset_meta),
             _training(cfg),
             _commands(self.config, cfg),
@@ -139,18 +141,34 @@ def _features(config: PointCloudPolicyConfig, dataset_meta: Any) -> str:
     assert config.input_features is not None
     for key, feature in {**config.input_features, **config.output_features}.items():
         if key == OBS_POINT_CLOUD:
-            meaning = "xyz of each point [m], in the frame of the training data"
+            colours = " and its colour, as the training data has it" if config.colour else ""
+            meaning = f"xyz of each point [m], in the frame of the training data{colours}"
         else:
             names = known.get(key, {}).get("names")
             listed = ", ".join(map(str, names)) if isinstance(names, list | tuple) else "not named in the data"
             meaning = f"{listed}; in the units of the training data"
         rows.append(f"| `{key}` | {tuple(feature.shape)} | {meaning} |")
-    rows += [
-        f"\n{name.capitalize()} of `{key}`: `{feature['info'][name]}`"
-        for key, feature in known.items()
-        for name in ("calibration", "crop")
-        if name in (feature.get("info") or {})
+    return "\n".join(rows)
+
+
+def _clouds(config: PointCloudPolicyConfig) -> str:
+    """Cameras, calibrations and crop, if the clouds were made from depth images."""
+    if config.depth.recipe is None:
+        return ""
+    recipe = CloudRecipe.from_dict(config.depth.recipe)
+    rows = [
+        "## Clouds from depth images\n",
+        f"Crop: {list(recipe.crop.low)} to {list(recipe.crop.high)} m in the robot's base, {recipe.n_points} points",
+        "On another robot LEROBOT_UCA_CALIBRATION names the folder of its calibrations.\n",
+        "| depth images | camera's place [m] | depth [m] | calibration |",
+        "|---|---|---|---|",
     ]
+    for source in recipe.sources:
+        made = source.calibration
+        place = [round(row[3], 3) for row in made.camera.X_world_camera[:3]]
+        error = "".join(f", error {value:g} {unit}" for unit, value in made.residual.items())
+        calibration = f"{made.method or 'by an unknown method'} {made.date}{error}"
+        rows.append(f"| `{source.key}` | {place} | {source.near:g} to {source.far:g} | {calibration} |")
     return "\n".join(rows)
 
 

@@ -31,11 +31,6 @@ from lerobot_uca.visual.live_camera import live_clouds
 
 logger = logging.getLogger(__name__)
 
-try:
-    from lerobot.cameras.realsense import RealSenseCameraConfig  # noqa: F401 (registers --camera.type=intelrealsense)
-except ImportError as error:  # librealsense is there, but not a library that it needs
-    logger.warning("RealSense cameras are not available: %s", error)
-
 WIDE = Crop((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))
 """[m] Where a crop is still to be chosen, everything within reach is shown."""
 MAX_POINTS = 20_000
