@@ -15,6 +15,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval
 
 from lerobot_uca.data.collect import CollectConfig, collect
+from lerobot_uca.data.convert import ConvertConfig, convert
 from lerobot_uca.deploy.export import export
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
@@ -154,3 +155,22 @@ def test_a_collected_dataset_is_pushed_and_trained_on_from_the_hub(hub, tmp_path
     original, copy = (LeRobotDataset("tester/data", root=tmp_path / name)[7] for name in ("data", "fetched"))
     assert torch.equal(original["observation.point_cloud"], copy["observation.point_cloud"])
     assert HfApi().list_repo_refs("tester/data", repo_type="dataset").tags[0].name == "v3.0"
+
+
+def test_a_converted_dataset_is_pushed_and_read_back(hub, data, tmp_path):
+    made = convert(
+        ConvertConfig(source=data, repo_id="tester/converted", root=tmp_path / "made", n_points=16, push_to_hub=True)
+    )
+    assert b"point-cloud" in hub.files("datasets/tester/converted")["README.md"]
+    fetched = LeRobotDataset("tester/converted", root=tmp_path / "fetched")
+    assert len(fetched) == len(made) == 39
+    for key in ("observation.point_cloud", "observation.state", "action"):
+        assert torch.equal(fetched[20][key], made[20][key])
+
+
+def test_a_converted_dataset_that_cannot_be_pushed_stays(hub, data, tmp_path, monkeypatch):
+    monkeypatch.setattr(hub, "is_full", True)
+    config = ConvertConfig(source=data, repo_id="tester/more", root=tmp_path / "made", n_points=16, push_to_hub=True)
+    with pytest.raises(UserError, match=r"The dataset in '.*made' is complete but could not be uploaded: .*full"):
+        convert(config)
+    assert len(LeRobotDataset("tester/more", root=tmp_path / "made")) == 39

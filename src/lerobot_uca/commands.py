@@ -13,18 +13,22 @@ def _begin() -> None:
     register_third_party_plugins()
 
 
-def collect() -> None:
-    """`lerobot-uca-collect`."""
-    _begin()
-    from lerobot_uca.data.collect import run
-
-    # LeRobot's parser wants a value for every option; a bare flag is what people type.
+def _read_bare_flags() -> None:
+    """LeRobot's parser wants a value for every option; a bare flag is what people type."""
     bare = {"--overwrite", "--push_to_hub", "--private"}
     followed_by_value = [*(not argument.startswith("-") for argument in sys.argv[2:]), False]
     sys.argv[1:] = [
         f"{argument}=true" if argument in bare and not has_value else argument
         for argument, has_value in zip(sys.argv[1:], followed_by_value, strict=False)
     ]
+
+
+def collect() -> None:
+    """`lerobot-uca-collect`."""
+    _begin()
+    from lerobot_uca.data.collect import run
+
+    _read_bare_flags()
     run()
 
 
@@ -33,6 +37,7 @@ def convert() -> None:
     _begin()
     from lerobot_uca.data.convert import run
 
+    _read_bare_flags()
     run()
 
 

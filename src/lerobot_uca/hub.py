@@ -4,6 +4,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineModeIsEnabled
@@ -29,6 +30,17 @@ def uploading(what: str, retry: str) -> Iterator[None]:
     except UPLOAD_ERRORS as error:
         reason = " ".join(str(error).split())
         raise UserError(f"{what} is complete but could not be uploaded: {reason} To upload it: {retry}") from error
+
+
+def push_dataset(dataset: Any, *, private: bool | None, tags: list[str]) -> None:
+    """Upload a LeRobot dataset.
+
+    Raises:
+        UserError: if it fails; it says how to upload the dataset, which stays.
+    """
+    retry = f"LeRobotDataset('{dataset.repo_id}', root='{dataset.root}').push_to_hub() in Python"
+    with uploading(f"The dataset in '{dataset.root}'", retry):
+        dataset.push_to_hub(private=private, tags=tags)
 
 
 def upload_command(repo_id: str | None, folder: Path, path_in_repo: str = ".") -> str:

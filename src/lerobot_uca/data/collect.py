@@ -29,7 +29,7 @@ from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt, smoothed
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.hub import uploading
+from lerobot_uca.hub import push_dataset
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO
 
 FIRST_SEED = 1_000_000
@@ -96,9 +96,7 @@ def collect(config: CollectConfig) -> LeRobotDataset:
         _write(config, env_config, attempts, unfinished)
     dataset = LeRobotDataset(config.repo_id, root=root)
     if config.push_to_hub:
-        retry = f"LeRobotDataset('{config.repo_id}', root='{root}').push_to_hub() in Python"
-        with uploading(f"The dataset in '{root}'", retry):
-            dataset.push_to_hub(private=config.private, tags=["point-cloud", env_config.type])
+        push_dataset(dataset, private=config.private, tags=["point-cloud", env_config.type])
     return dataset
 
 

@@ -30,6 +30,7 @@ from lerobot_uca.data.sources.source import Source
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.hub import push_dataset
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import MIN_SHARE
 from lerobot_uca.point_clouds.geometry import sample_farthest
@@ -77,6 +78,10 @@ class ConvertConfig:
     report: Path | None = None
     # Replace the folder if it exists.
     overwrite: bool = False
+    # Upload the dataset to the Hugging Face Hub under repo_id.
+    push_to_hub: bool = False
+    # Upload as a private dataset; by default as the account's settings say.
+    private: bool | None = None
 
 
 class Episode(NamedTuple):
@@ -93,7 +98,8 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
     """Convert, write whole or not at all, and open the new dataset.
 
     Raises:
-        UserError: for a source that cannot be read or does not fit, and for frames with too few points.
+        UserError: for a source that cannot be read or does not fit, for frames with too few points, and for an upload
+            that fails.
     """
     try:
         validate_repo_id(config.repo_id)
@@ -110,7 +116,10 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
         _write(config, source, fps, episodes, unfinished)
     if left_out := source.left_out():
         logger.warning("Not kept: %s.", ", ".join(left_out))
-    return LeRobotDataset(config.repo_id, root=root)
+    dataset = LeRobotDataset(config.repo_id, root=root)
+    if config.push_to_hub:
+        push_dataset(dataset, private=config.private, tags=["point-cloud"])
+    return dataset
 
 
 def make_source(config: ConvertConfig) -> Source:
