@@ -113,6 +113,12 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen) -> None:
         time.sleep(0.02)
 
 
+def heed_signals() -> None:
+    """In the child: whoever runs these tests may ignore some, as nohup does."""
+    for number in LINES:
+        signal.signal(number, signal.SIG_DFL)
+
+
 def group_is_empty(group: int) -> bool:
     """Whether no process of a group lives."""
     try:
@@ -130,8 +136,8 @@ def test_a_command_ends_cleanly(program, trained, tmp_path):
     command = [BIN / program, *case.arguments(folder, trained)]
     printed = tmp_path / "printed.txt"
     with printed.open("w") as file:
-        variables = {**os.environ, "OMP_NUM_THREADS": "1"}
-        process = subprocess.Popen(command, stdout=file, stderr=file, env=variables, cwd=folder, start_new_session=True)
+        options = {"env": {**os.environ, "OMP_NUM_THREADS": "1"}, "cwd": folder, "start_new_session": True}
+        process = subprocess.Popen(command, stdout=file, stderr=file, preexec_fn=heed_signals, **options)
     try:
         wait_for(lambda: case.is_working(folder, printed.read_text()), process)
         if case.signal == signal.SIGINT:  # a terminal sends it to all of its processes
