@@ -22,6 +22,13 @@ LINES = {
     signal.SIGTERM: "ended by SIGTERM",
     signal.SIGHUP: "ended by SIGHUP",
 }
+HEEDS_SIGNALS = """
+import os, signal, sys
+for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+    signal.signal(getattr(signal, name), signal.SIG_DFL)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+"""Runs a command; whoever runs these tests may ignore signals, as nohup does."""
 LIMIT = 600
 """Seconds after which a command that has not begun its work, or not ended, hangs."""
 
@@ -113,12 +120,6 @@ def wait_for(condition: Callable[[], bool], process: subprocess.Popen) -> None:
         time.sleep(0.02)
 
 
-def heed_signals() -> None:
-    """In the child: whoever runs these tests may ignore some, as nohup does."""
-    for number in LINES:
-        signal.signal(number, signal.SIG_DFL)
-
-
 def group_is_empty(group: int) -> bool:
     """Whether no process of a group lives."""
     try:
@@ -133,11 +134,11 @@ def test_a_command_ends_cleanly(program, trained, tmp_path):
     case = CASES[program]
     folder = tmp_path / "work"
     folder.mkdir()
-    command = [BIN / program, *case.arguments(folder, trained)]
+    command = [sys.executable, "-c", HEEDS_SIGNALS, BIN / program, *case.arguments(folder, trained)]
     printed = tmp_path / "printed.txt"
     with printed.open("w") as file:
         options = {"env": {**os.environ, "OMP_NUM_THREADS": "1"}, "cwd": folder, "start_new_session": True}
-        process = subprocess.Popen(command, stdout=file, stderr=file, preexec_fn=heed_signals, **options)
+        process = subprocess.Popen(command, stdout=file, stderr=file, **options)
     try:
         wait_for(lambda: case.is_working(folder, printed.read_text()), process)
         if case.signal == signal.SIGINT:  # a terminal sends it to all of its processes
