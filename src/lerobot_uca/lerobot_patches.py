@@ -62,6 +62,7 @@ USED_NAMES = (
     "lerobot.datasets.lerobot_dataset.LeRobotDataset._ensure_reader",
     "lerobot.datasets.sampler.EpisodeAwareSampler.state_dict",
     "lerobot.envs.utils._LazyAsyncVectorEnv",
+    "lerobot.envs.utils._LazyAsyncVectorEnv._ensure",
     "lerobot.envs.utils.freeze_after_episode_end",
     "lerobot.policies.factory.make_pre_post_processors",
     "lerobot.policies.pretrained.PreTrainedPolicy._load_as_safetensor",
