@@ -163,9 +163,12 @@ def kill_writer(make: Callable[[Path], list[str]], folder: Path, n_kills: int, r
     seconds = time.monotonic() - begin
     kills, root, absent, killed_writing = Kills(), folder / "killed" / "data", 0, 0
     while kills.n < n_kills:
+        begin = time.monotonic()
         if kills.run(make(root), seconds * (0.3 + 0.7 * rng.random())):
             killed_writing += any(root.parent.glob(".*.unfinished-*"))
             absent += not root.exists()
+        else:
+            seconds = time.monotonic() - begin  # the machine is less busy than it was
         shutil.rmtree(root, ignore_errors=True)
     subprocess.run(make(root), check=True, capture_output=True)
     left = sorted(path.name for path in root.parent.iterdir())

@@ -11,7 +11,13 @@ import pytest
 
 from lerobot_uca.processes import worker_pool
 
-COMMAND = """
+HEED = (
+    "import signal\n"
+    "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    "for number in (signal.SIGTERM, signal.SIGHUP):\n    signal.signal(number, signal.SIG_DFL)\n"
+)
+"""Whoever runs these tests may ignore signals, as nohup does."""
+COMMAND = f"""{HEED}
 import sys, time
 from lerobot_uca.processes import end_by_signals
 end_by_signals()
