@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_uca import point_clouds
 from lerobot_uca.point_clouds import ray_casting, single_rays
-from lerobot_uca.point_clouds.geometry import Camera
+from lerobot_uca.point_clouds.geometry import Camera, ray_sphere_distances
+from lerobot_uca.point_clouds.intersections import at_triangle, triangle
 from lerobot_uca.point_clouds.ray_casting import RayCaster
 from lerobot_uca.point_clouds.ray_kernels import cast_at
 from lerobot_uca.point_clouds.rays import Hits, Rays
@@ -71,6 +72,44 @@ def test_hits_of_one_geom(kind):
         if kind == "mesh":
             np.testing.assert_array_equal(hits.distance, expected.distance)  # bit by bit
     assert n_hits > 50
+
+
+def test_rays_that_meet_corners_are_cast_at_every_triangle_around():
+    """A rough sheet below the camera whose corners, seen from there, are centres of pixels.
+
+    Against each triangle and each ray: MuJoCo's tree misses rays along the boxes around triangles.
+    """
+    camera = Camera.from_fovy("top", (0.0, 0.0, 1.0), np.eye(3).tolist(), 90.0, (17, 17))
+    rays = Rays.of(camera, np.ones(17 * 17, bool))
+    depth = np.random.default_rng(0).uniform(0.9, 1, 9 * 9)
+    x, y = (each.ravel() / 8.5 * depth for each in np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)))
+    corners = [9 * row + column for row in range(8) for column in range(8)]
+    faces = [f"{i} {i + 1} {i + 9} {i + 1} {i + 10} {i + 9}" for i in corners]
+    vertices = " ".join(map(str, np.stack([x, y, 1 - depth], axis=1).ravel()))
+    xml = f"""<mujoco><asset><mesh name="sheet" vertex="{vertices}" face="{" ".join(faces)}"/></asset>
+      <worldbody><geom type="mesh" mesh="sheet"/></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    hits = Hits.none(len(rays.directions), with_normals=False)
+    cast_at(np.arange(1), model, data, rays, hits)
+    rotation = data.geom_xmat[0].reshape(3, 3)
+    origin, directions = (rays.origin - data.geom_xpos[0]) @ rotation, rays.directions @ rotation
+    triangles = [triangle(tuple(origin), *model.mesh_vert[face]) for face in model.mesh_face]
+    expected = [min(at_triangle(tuple(direction), each)[0] for each in triangles) for direction in directions]
+    np.testing.assert_allclose(hits.distance, expected, rtol=1e-12)
+    assert np.isfinite(hits.distance).sum() >= 8 * 8
+
+
+def test_rays_around_a_sphere():
+    """None that meets it is left out, and most others are."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        centre, radius = rng.uniform((-0.8, -0.8, -0.5), (0.8, 0.8, 1.4)), rng.uniform(0.01, 0.3)
+        meeting = np.flatnonzero(np.isfinite(ray_sphere_distances(RAYS.origin, RAYS.directions, centre, radius)))
+        assert set(meeting) <= set(RAYS.around(centre, radius))
+    assert 0 < len(RAYS.around(np.zeros(3), 0.1)) < len(ALL) / 10
+    assert len(RAYS.around(np.array([0, 0, 1.5]), 0.1)) == len(ALL)  # the camera inside it
 
 
 def test_hits_of_a_crowd():

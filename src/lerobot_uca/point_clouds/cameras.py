@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, ray_sphere_distances
 from lerobot_uca.point_clouds.ray_casting import RayCaster
+from lerobot_uca.point_clouds.rays import Rays
 
 ROUNDING = 1e-9  # [m], far above that of a distance and far below what a camera resolves
 MIN_LENGTH = 1e-30  # [m]; a ray without a hit has a normal of length 0
@@ -82,12 +83,9 @@ class PictureCamera:
             self._model, self._colours = model, surface_colours(model)
         colour = self._colours[geom]
         for marker in markers:
-            to_marker = ray_sphere_distances(rays.origin, rays.directions, marker.centre, marker.radius)
-            nearer = to_marker < distance
-            surface = rays.origin + rays.directions[nearer] * to_marker[nearer, None]
-            normal[nearer] = surface - marker.centre
+            nearer = _put_nearer(distance, rays, marker)
+            normal[nearer] = rays.origin + rays.directions[nearer] * distance[nearer, None] - marker.centre
             colour[nearer] = marker.colour
-            np.minimum(distance, to_marker, out=distance)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), MIN_LENGTH)
         picture = shade(colour, normal, rays.directions)
         picture[np.isinf(distance)] = BACKGROUND
@@ -98,9 +96,17 @@ def _distances(caster: RayCaster, model: mujoco.MjModel, data: mujoco.MjData, ma
     """The distance to the nearest surface or marker along each ray, (R,) [m]."""
     distance = caster.cast(model, data).distance
     for marker in markers:
-        to_marker = ray_sphere_distances(caster.rays.origin, caster.rays.directions, marker.centre, marker.radius)
-        np.minimum(distance, to_marker, out=distance)
+        _put_nearer(distance, caster.rays, marker)
     return distance
+
+
+def _put_nearer(distance: Array, rays: Rays, marker: Marker) -> NDArray[np.intp]:
+    """Replace the distances (R,) of those rays that a marker is nearer along, and return these rays."""
+    around = rays.around(marker.centre, marker.radius)
+    to_marker = ray_sphere_distances(rays.origin, rays.directions[around], marker.centre, marker.radius)
+    nearer = to_marker < distance[around]
+    distance[around[nearer]] = to_marker[nearer]
+    return around[nearer]
 
 
 def shade(colours: Array, normals: Array, directions: Array) -> NDArray[np.uint8]:

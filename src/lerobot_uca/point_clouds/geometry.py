@@ -131,7 +131,8 @@ class Crop:
 
     def contains(self, points: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
         """Whether each of the points (N, 3) lies inside, (N,)."""
-        return np.all((points >= self.low) & (points <= self.high), axis=1)
+        x, y, z = ((points >= self.low) & (points <= self.high)).T  # np.all takes twice as long
+        return x & y & z
 
     def span(self, origin: Array, directions: Array) -> tuple[Array, Array]:
         """Distances [m] at which rays from origin (3,) along directions (R, 3) enter and leave the box, (R,) each.
@@ -150,7 +151,7 @@ class Crop:
 def ray_sphere_distances(origin: Array, directions: Array, centre: Array, radius: float) -> Array:
     """Distances [m] from origin (3,) along unit directions (R, 3) to a sphere, (R,); inf for a miss."""
     to_centre = centre - origin
-    along = np.einsum("rc,c->r", directions, to_centre)  # not by BLAS, see ray_casting.py
+    along = np.einsum("rc,c->r", directions, to_centre)  # not by BLAS, whose threads would spin
     half_chord_squared = radius**2 - (to_centre @ to_centre - along**2)
     hit = (half_chord_squared >= 0) & (along > 0)
     return np.where(hit, along - np.sqrt(np.maximum(half_chord_squared, 0)), np.inf)

@@ -1,7 +1,7 @@
 """Rays against single surfaces in their own frame, compiled by Numba, by the formulas of MuJoCo's ray casting."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numba
@@ -40,29 +40,44 @@ def compiled(function: Callable[..., Any]) -> Any:
         return numba.njit(nogil=True)(function)
 
 
+class Triangle(NamedTuple):
+    """A triangle a, b, c as seen from the rays' origin: what is the same for all rays."""
+
+    p: Vector  # a - c
+    q: Vector  # b - c
+    s: Vector  # origin - c
+    normal: Vector  # p x q, of any length
+    height: float  # s times normal
+
+
 @compiled
-def at_triangle(
-    origin: Vector, direction: Vector, a: NDArray[np.float32], b: NDArray[np.float32], c: NDArray[np.float32]
-) -> Hit:
-    """Where a ray meets the triangle a, b, c, (3,) each, from either side."""
+def triangle(origin: Vector, a: NDArray[np.float32], b: NDArray[np.float32], c: NDArray[np.float32]) -> Triangle:
+    """The triangle of three corners (3,), in the frame of the origin."""
     c0, c1, c2 = np.float64(c[0]), np.float64(c[1]), np.float64(c[2])
     p0, p1, p2 = a[0] - c0, a[1] - c1, a[2] - c2
     q0, q1, q2 = b[0] - c0, b[1] - c1, b[2] - c2
     s0, s1, s2 = origin[0] - c0, origin[1] - c1, origin[2] - c2
     n0, n1, n2 = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0
-    denominator = direction[0] * n0 + direction[1] * n1 + direction[2] * n2
+    return Triangle((p0, p1, p2), (q0, q1, q2), (s0, s1, s2), (n0, n1, n2), s0 * n0 + s1 * n1 + s2 * n2)
+
+
+@compiled
+def at_triangle(direction: Vector, triangle: Triangle) -> Hit:
+    """Where a ray meets a triangle, from either side."""
+    p, q, s, n = triangle.p, triangle.q, triangle.s, triangle.normal
+    denominator = direction[0] * n[0] + direction[1] * n[1] + direction[2] * n[2]
     if abs(denominator) < MIN_DENOMINATOR:
         return MISS
     # Cramer's rule for c + u (a - c) + v (b - c) = origin + t direction.
-    e0 = s1 * direction[2] - s2 * direction[1]
-    e1 = s2 * direction[0] - s0 * direction[2]
-    e2 = s0 * direction[1] - s1 * direction[0]
-    u = -(q0 * e0 + q1 * e1 + q2 * e2) / denominator
-    v = (p0 * e0 + p1 * e1 + p2 * e2) / denominator
-    t = -(s0 * n0 + s1 * n1 + s2 * n2) / denominator
-    if u < 0 or v < 0 or u + v > 1 or t < 0:
-        return MISS
-    return t, (n0, n1, n2)
+    e0 = s[1] * direction[2] - s[2] * direction[1]
+    e1 = s[2] * direction[0] - s[0] * direction[2]
+    e2 = s[0] * direction[1] - s[1] * direction[0]
+    u = -(q[0] * e0 + q[1] * e1 + q[2] * e2) / denominator
+    v = (p[0] * e0 + p[1] * e1 + p[2] * e2) / denominator
+    t = -triangle.height / denominator
+    if (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0):  # one branch, which is easily foretold
+        return t, n
+    return MISS
 
 
 @compiled

@@ -1,11 +1,16 @@
 """The rays of a camera and their first hits. Letters: H x W pixels, R rays. Lengths in metres, world frame."""
 
+import itertools
+import math
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_uca.point_clouds.geometry import Array, Camera
+
+NEAREST_DEPTH = 1e-3  # [m]; what is nearer to the camera's plane, or behind it, has no exact projection
+_CUBE = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 class Rays(NamedTuple):
@@ -25,6 +30,18 @@ class Rays(NamedTuple):
         projection = intrinsics @ np.array(camera.X_world_camera)[:3, :3].T
         directions = camera.ray_directions()[matters]
         return cls(camera.position, directions, projection, of_pixel.reshape(camera.height, camera.width))
+
+    def around(self, centre: Array, radius: float) -> NDArray[np.int32]:
+        """The rays, and some more, that may meet a sphere: those through the pixels of a cube around it."""
+        corners = centre + radius * _CUBE - self.origin
+        columns, rows, depths = self.projection @ corners.T
+        if depths.min() < NEAREST_DEPTH:  # it reaches behind the camera
+            return np.arange(len(self.directions), dtype=np.int32)
+        columns, rows = columns / depths, rows / depths
+        left, top = (max(0, math.floor(pixels.min())) for pixels in (columns, rows))
+        right, bottom = (max(0, math.ceil(pixels.max()) + 1) for pixels in (columns, rows))
+        window = self.of_pixel[top:bottom, left:right].ravel()
+        return window[window >= 0]
 
 
 class Hits(NamedTuple):
