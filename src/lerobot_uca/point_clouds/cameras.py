@@ -48,8 +48,14 @@ class PointCloudCamera:
 
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
         """Visible points inside the crop, (N, 3), world frame [m]. `data` must be up to date (`mj_forward`)."""
+        distance = self._caster.cast(model, data).distance
+        return self.points(distance, markers)
+
+    def points(self, distance: Array, markers: Sequence[Marker]) -> Array:
+        """Points inside the crop at surfaces' distances (R,) along the rays [m], or at markers before them, (N, 3)."""
         rays = self._caster.rays
-        distance = _distances(self._caster, model, data, markers)
+        for marker in markers:
+            _put_nearer(distance, rays, marker)
         near = np.flatnonzero((distance >= self._enter) & (distance <= self._leave))
         points = rays.origin + rays.directions[near] * distance[near, None]
         return points[self.crop.contains(points)]
@@ -64,7 +70,10 @@ class DepthCamera:
 
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
         """Depths (H, W) [m], inf where nothing is. `to_millimetres` makes of them what a RealSense camera gives."""
-        return self.camera.depth(_distances(self._caster, model, data, markers))
+        distance = self._caster.cast(model, data).distance
+        for marker in markers:
+            _put_nearer(distance, self._caster.rays, marker)
+        return self.camera.depth(distance)
 
 
 class PictureCamera:
@@ -92,15 +101,7 @@ class PictureCamera:
         return picture.reshape(self.camera.height, self.camera.width, 3)
 
 
-def _distances(caster: RayCaster, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker]) -> Array:
-    """The distance to the nearest surface or marker along each ray, (R,) [m]."""
-    distance = caster.cast(model, data).distance
-    for marker in markers:
-        _put_nearer(distance, caster.rays, marker)
-    return distance
-
-
-def _put_nearer(distance: Array, rays: Rays, marker: Marker) -> NDArray[np.intp]:
+def _put_nearer(distance: Array, rays: Rays, marker: Marker) -> NDArray[np.int32]:
     """Replace the distances (R,) of those rays that a marker is nearer along, and return these rays."""
     around = rays.around(marker.centre, marker.radius)
     to_marker = ray_sphere_distances(rays.origin, rays.directions[around], marker.centre, marker.radius)
