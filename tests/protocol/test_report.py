@@ -1,6 +1,9 @@
 """Tables and figures of results made up so that every number can be told in advance."""
 
 import csv
+import re
+import shutil
+import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -98,6 +101,58 @@ def test_table_1(folder, tmp_path, capsys):
     assert honest[7].endswith("(2 of 37 tasks)")
     assert lines["DP3", "ours, honest"] == ["missing"] * 8
     assert "Setting 'tiny': made up. Made on: a CPU (2 cores, 1 thread a cell)." in capsys.readouterr().out
+
+
+WIDE = """\\documentclass{article}
+\\usepackage{booktabs,graphicx}
+\\begin{document}
+TABLES
+\\end{document}
+"""
+
+
+def latex_tables(folder, tmp_path):
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    return {path.name: path.read_text() for path in sorted((tmp_path / "report").glob("*.tex"))}
+
+
+def test_latex_is_balanced_and_escaped(tmp_path):
+    """Also with a setting that is called and described as nobody would."""
+    setting = replace(SETTING, name="a_b", description=r"50 % & #1 of {x}_y^2, c:\d ~ $3 <4> or not")
+    folder = RunFolder.create(tmp_path / "run", setting)
+    for policy, n_final in (("uca_flow", 80), ("adaln", 60)):
+        add_cell(folder, Cell(REACH, policy, 0), n_final)
+    tables = latex_tables(folder, tmp_path)
+    assert len(tables) == 5
+    for text in tables.values():
+        assert r"50 \% \& \#1 of \{x\}\_y\textasciicircum{}2, c:\textbackslash{}d \textasciitilde{} \$3 $<$4$>$" in text
+        plain = re.sub(r"\\[\\%_&#{}$]", "", text)  # without what is escaped
+        assert plain.count("{") == plain.count("}")
+        assert plain.count("$") % 2 == 0
+        assert "^" not in plain
+        assert "#" not in plain
+        assert re.findall(r"%.*", plain) == ["%", "%"]  # at the ends of lines, where no space shall be
+        _, columns, body = re.split(r"\\begin\{tabular\}\{([lc]*)\}", text)
+        rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+        assert {len(re.findall(r"(?<!\\)&", row)) for row in rows} == {len(columns) - 1}
+
+
+def test_cells_in_latex(folder, tmp_path):
+    table = latex_tables(folder, tmp_path)["table_1.tex"]
+    assert r"$92.4_{\pm 1.2}$" in table
+    assert r"$90.0_{\pm 0.0}$\textsuperscript{2 of 21 tasks}" in table
+    assert re.search(r"\$92\.5_\{\[[\d.]+, [\d.]+\]\}\$\\textsuperscript\{2 of 21 tasks\}", table)
+    assert "missing" in table
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs LaTeX")
+def test_latex_compiles_to_tables_on_the_page(folder, tmp_path):
+    (tmp_path / "all.tex").write_text(WIDE.replace("TABLES", "\n".join(latex_tables(folder, tmp_path).values())))
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "all.tex"]
+    result = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout
+    assert "Overfull" not in result.stdout
+    assert (tmp_path / "all.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_wilson_for_a_task_and_milliseconds_for_a_policy(folder):

@@ -6,14 +6,20 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from tests.builders import N_POINTS, write_dataset
 
+from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import RunFolder
+from lerobot_uca.protocol.report import report
+from lerobot_uca.protocol.results import Results
+from lerobot_uca.protocol.rollouts import film
 from lerobot_uca.protocol.rows import Row
 from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.protocol.training import checkpoint
 
 TASK = "metaworld/drawer-close"
 GOOD, BAD = Cell(TASK, "uca_flow", 0), Cell(TASK, "simple_dp3", 0)
@@ -104,6 +110,28 @@ def test_progress_is_in_a_log_file(finished):
     assert "[2/2, 0:00 h left]" in log
     assert "finished: 1, failed: 1, being worked on by another process: 0" in log
     assert set(log.splitlines()) <= set(result.stdout.splitlines())
+
+
+def test_rollouts_are_shown_when_asked_for(finished, tmp_path):
+    """An episode of the rows is run again: it ends where they say, and its pictures are different ones."""
+    folder, _ = finished
+    row = Results.read([folder.path])[0].typical_episode(GOOD)
+    strip = film(checkpoint(folder.cell(GOOD), 4), GOOD, row)
+    assert (strip.cell, strip.episode_seed, strip.success) == (GOOD, row.episode_seed, row.success)
+    assert list(strip.pictures) == np.linspace(0, row.length, 6).round().tolist()
+    assert len({picture.tobytes() for picture in strip.pictures.values()}) == 6
+    written = report([folder.path], tmp_path / "report", as_html=True, rollouts_of=[GOOD.task])
+    assert "Table 1" in written
+    assert (tmp_path / "report" / "rollouts.png").read_bytes().startswith(b"\x89PNG")
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "An evaluation episode of each policy" in page
+    assert page.count("data:image/png;base64") == 6
+    report([folder.path], tmp_path / "plain", as_html=False)
+    assert not (tmp_path / "plain" / "rollouts.png").exists()
+    with pytest.raises(UserError, match=r"No finished cell of metaworld/reach has its last checkpoint in"):
+        report([folder.path], tmp_path / "other", as_html=False, rollouts_of=["metaworld/reach"])
+    with pytest.raises(UserError, match="has its last checkpoint"):  # rows alone make no pictures
+        report([tmp_path / "plain"], tmp_path / "other", as_html=False, rollouts_of=[GOOD.task])
 
 
 def test_a_finished_cell_is_not_done_again(finished):

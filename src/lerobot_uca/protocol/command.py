@@ -91,6 +91,7 @@ REPORT_HELP = """\
 The paper's Tables 1 to 3 with the paper's numbers beside ours, as Markdown, CSV and LaTeX, and figures (PNG, SVG).
 
   lerobot-uca-benchmark report runs/small --output=report --html
+  lerobot-uca-benchmark report runs/small --output=report --html --rollouts=door,drawer-close
 
 Cells that are missing are shown as missing, so a report can be made while the run goes on. Several folders are taken
 together if they were made with one setting. The report's folder holds all rows, and can itself be reported.
@@ -108,11 +109,15 @@ def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     parser.add_argument("runs", type=Path, nargs="+", metavar="DIR", help="folder of a run or of a report")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
     parser.add_argument("--html", action="store_true", help="also one self-contained page, report.html")
+    parser.add_argument(
+        "--rollouts", metavar="TASKS", help="also strips of pictures, an episode of each policy on these tasks"
+    )
     parser.set_defaults(do=_report)
 
 
 def _report(args: argparse.Namespace) -> None:
-    print(report(args.runs, args.output, as_html=args.html))
+    tasks = resolve_tasks("all", args.rollouts) if args.rollouts is not None else ()
+    print(report(args.runs, args.output, as_html=args.html, rollouts_of=tasks))
     print(f"Written to {args.output}.", file=sys.stderr)
 
 

@@ -10,7 +10,7 @@ and its seed, not on which others ran beside it (rounding apart: a matrix produc
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -29,6 +29,12 @@ from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 
 Plan = Callable[[list["Running"]], NDArray[np.float32]]
+Watch = Callable[[PointCloudEnv, int], None]
+"""Is shown an environment when it is reset and after each action, and how many actions were executed."""
+
+
+def not_watched(env: PointCloudEnv, step: int) -> None:
+    """Look at nothing."""
 
 
 class Episode(NamedTuple):
@@ -49,15 +55,17 @@ class Running:
         env: which is reset.
         seed: of the episode.
         config: says which steps the policy looks at.
+        watch: is shown each step.
     """
 
-    def __init__(self, env: PointCloudEnv, seed: int, config: PointCloudPolicyConfig) -> None:
-        self.env, self.seed = env, seed
+    def __init__(self, env: PointCloudEnv, seed: int, config: PointCloudPolicyConfig, watch: Watch) -> None:
+        self.env, self.seed, self._watch = env, seed, watch
         self.noise = torch.Generator().manual_seed(seed)
         self.is_over = self.success = False
         self._total, self._length, self.seconds = 0.0, 0, 0.0
         self._deltas, self._n_planned = config.observation_delta_indices, config.n_action_steps
         observation, _ = env.reset(seed=seed)
+        watch(env, 0)
         self._observed: dict[int, Observation] = {0: observation}  # by step
 
     def history(self) -> list[Observation]:
@@ -70,6 +78,7 @@ class Running:
         for action in actions:
             reward, terminated, truncated, info = self.env.act(action)
             self._length += 1
+            self._watch(self.env, self._length)
             self._total += reward
             self.success |= bool(info["is_success"])
             self.is_over = terminated or truncated
@@ -97,7 +106,8 @@ def run_episodes(
     seeds: Iterable[int],
     *,
     n_envs: int,
-) -> Iterator[Episode]:
+    watch: Watch = not_watched,
+) -> Generator[Episode]:
     """Episodes of the seeds, as they end.
 
     Args:
@@ -106,6 +116,7 @@ def run_episodes(
         plan: the policy's actions for some episodes E, (E, n_action_steps, A).
         seeds: of the episodes.
         n_envs: how many run at once.
+        watch: is shown each step of each.
     """
     waiting = deque(seeds)
     idle = [make_env() for _ in range(min(n_envs, len(waiting)))]
@@ -113,7 +124,7 @@ def run_episodes(
     try:
         while waiting or running:
             while idle and waiting:
-                running.append(Running(idle.pop(), waiting.popleft(), config))
+                running.append(Running(idle.pop(), waiting.popleft(), config, watch))
             begin = time.perf_counter()
             planned = plan(running)
             share = (time.perf_counter() - begin) / len(running)

@@ -17,7 +17,7 @@ COLUMNS = ("hammer", "door", "pen", "easy", "medium", "hard", "very_hard", "aver
 
 
 def _row(*numbers: tuple[float, float]) -> dict[str, Printed]:
-    return {column: Printed(*number) for column, number in zip(COLUMNS, numbers, strict=True)}
+    return {column: Printed(*map(float, number)) for column, number in zip(COLUMNS, numbers, strict=True)}
 
 
 SUCCESS = {
@@ -76,7 +76,7 @@ _ABLATION = {
     ),
 }
 ABLATION = {
-    policy: {task: Printed(*number) for task, number in zip(SUITES["ablation"], numbers, strict=True)}
+    policy: {task: Printed(*map(float, number)) for task, number in zip(SUITES["ablation"], numbers, strict=True)}
     for policy, numbers in _ABLATION.items()
 }
 """Table 3: success [%] by task."""

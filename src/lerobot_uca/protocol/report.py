@@ -7,20 +7,27 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.protocol.figures import draw
+from lerobot_uca.protocol import rollouts
+from lerobot_uca.protocol.figures import CAPTIONS, draw
 from lerobot_uca.protocol.results import Results
 from lerobot_uca.protocol.tables import TABLES, setting_of
 
 STYLE = """\
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-section { overflow-x: auto } table { border-collapse: collapse; font-size: 0.85rem; white-space: nowrap }
-th, td { padding: 0.25rem 0.6rem; text-align: left; border-bottom: 1px solid #ddd }
+section { overflow-x: auto } table { border-collapse: collapse; font-size: 0.8rem }
+th, td { padding: 0.25rem 0.4rem; text-align: left; vertical-align: top; border-bottom: 1px solid #ddd }
 tbody tr:hover { background: #f3f6fa } svg { max-width: 100%; height: auto }
 """
 
 
-def report(runs: Sequence[Path], output: Path, *, as_html: bool) -> str:
+def report(runs: Sequence[Path], output: Path, *, as_html: bool, rollouts_of: Sequence[str] = ()) -> str:
     """Write tables (Markdown, CSV, LaTeX), figures (PNG, SVG) and the results themselves; the tables as Markdown.
+
+    Args:
+        runs: folders of runs or reports.
+        output: folder to write.
+        as_html: whether to write one page as well.
+        rollouts_of: tasks of which an episode of each policy is shown; for that it is run again.
 
     Raises:
         UserError: if there are no results, or the folder cannot be written.
@@ -40,6 +47,8 @@ def report(runs: Sequence[Path], output: Path, *, as_html: bool) -> str:
             (output / f"{table.name}.csv").write_text(table.csv(), encoding="utf-8")
             (output / f"{table.name}.tex").write_text(table.latex(), encoding="utf-8")
         figures = draw(results, output)
+        if rollouts_of:
+            figures.append(rollouts.draw(runs, results, rollouts_of, output))
         if as_html:
             page = _page(results, [table.html() for table in tables], figures)
             (output / "report.html").write_text(page, encoding="utf-8")
@@ -51,7 +60,7 @@ def report(runs: Sequence[Path], output: Path, *, as_html: bool) -> str:
 def _page(results: Results, tables: Sequence[str], figures: Sequence[Path]) -> str:
     """One page that needs nothing else."""
     pictures = [
-        f"<figure>{_inline(path, index)}<figcaption>{path.stem.replace('_', ' ').capitalize()}</figcaption></figure>"
+        f"<figure>{_inline(path, index)}<figcaption>{CAPTIONS[path.stem]}</figcaption></figure>"
         for index, path in enumerate(figures)
     ]
     n_cells = len(results.records)

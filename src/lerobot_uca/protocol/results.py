@@ -76,6 +76,17 @@ class Results:
         """Training seeds whose last checkpoint is evaluated."""
         return [cell.seed for cell in self._cells if cell[:2] == (task, policy) and cell in self._final]
 
+    def first_cells(self) -> list[Cell]:
+        """Of each policy on each task the first training seed whose last checkpoint is evaluated."""
+        found = [(task, policy, self.seeds(task, policy)) for task in self.tasks for policy in self.policies]
+        return [Cell(task, policy, seeds[0]) for task, policy, seeds in found if seeds]
+
+    def typical_episode(self, cell: Cell) -> Row:
+        """The first fresh episode that ended as most of the cell's did."""
+        final = [row for row in self.rows if row.cell == cell and row.is_final]
+        mostly = 2 * sum(row.success for row in final) >= len(final)
+        return next(row for row in final if row.success == mostly)
+
     # The honest rule: the last checkpoint, fresh episodes. ------------------------------------------------------
 
     def successes(self, task: str, policy: str) -> Successes:

@@ -9,7 +9,7 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
 from io import TextIOWrapper
@@ -25,6 +25,7 @@ from lerobot_uca.protocol.tied import tie_to_parent
 from lerobot_uca.protocol.training import CellError, NoSpaceError, no_space_as_such
 
 if TYPE_CHECKING:
+    from lerobot_uca.envs.point_cloud_env import PointCloudEnv
     from lerobot_uca.protocol.evaluation import PolicyPlan
 
 N_ENVS = 10
@@ -81,7 +82,7 @@ def _work(folder: RunFolder, cell: Cell, expert: str | None, lock: TextIOWrapper
 
 def _evaluate(folder: RunFolder, cell: Cell, dataset: Path) -> None:
     """Make the rows that are missing. A checkpoint whose rows are there is removed, unless it is the last one."""
-    _load_lerobot()
+    load_lerobot()
     files, setting = folder.cell(cell), folder.setting
     length = setting.length(cell)
     files.rows.mkdir(exist_ok=True)
@@ -93,7 +94,7 @@ def _evaluate(folder: RunFolder, cell: Cell, dataset: Path) -> None:
     _evaluate_checkpoint(folder, cell, dataset, length.steps, is_final=True)
 
 
-def _load_lerobot() -> None:
+def load_lerobot() -> None:
     """Load LeRobot only when it is needed: during the training its memory is the training's."""
     import torch
     from lerobot.utils.import_utils import register_third_party_plugins
@@ -118,7 +119,7 @@ def _evaluate_checkpoint(folder: RunFolder, cell: Cell, dataset: Path, step: int
     epoch = step * setting.batch_size / _n_frames(dataset)
     index = step // setting.length(cell).interval - 1
     seeds = setting.final_seeds(cell) if is_final else setting.interim_seeds(cell, index)
-    episodes = run_episodes(_make_env(cell, plan), plan.config, plan, seeds, n_envs=N_ENVS)
+    episodes = run_episodes(make_env(cell, plan), plan.config, plan, seeds, n_envs=N_ENVS)
     rows = [
         Row(*cell, step, epoch, is_final, each.seed, each.success, each.episode_return, each.length, each.ms)
         for each in episodes
@@ -129,11 +130,11 @@ def _evaluate_checkpoint(folder: RunFolder, cell: Cell, dataset: Path, step: int
     folder.log(f"{cell}: after {step} steps {success:.0f} % of {len(rows)} {'fresh ' * is_final}episodes")
 
 
-def _make_env(cell: Cell, plan: "PolicyPlan") -> Any:
+def make_env(cell: Cell, plan: "PolicyPlan") -> Callable[[], "PointCloudEnv"]:
     """Makes the cell's environment, with no more points than the policy looks at: the first ones are the same."""
     from lerobot.envs.configs import EnvConfig
 
-    config = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
+    config: Any = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
     config.n_points = plan.config.n_points or config.n_points
     return config.env_factory(cell.env_task)
 

@@ -3,6 +3,7 @@
 import csv
 import html
 import io
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -44,20 +45,24 @@ class Table:
         return file.getvalue()
 
     def latex(self) -> str:
-        """The table in LaTeX, for booktabs."""
-        lines = [" & ".join(map(_latex, row)) + r" \\" for row in (self.header, *self.rows)]
+        """The table in LaTeX, as wide as the page, with the packages booktabs and graphicx."""
+        title = re.sub(r"^Table \d: ", "", self.title)  # LaTeX numbers tables itself
+        title = title[0].upper() + title[1:]
+        lines = [" & ".join(map(_latex_cell, row)) + r" \\" for row in (self.header, *self.rows)]
         return "\n".join(
             [
-                r"\begin{table}",
-                rf"\caption{{{_latex(self.title)}. {_latex(self.caption)}}}",
+                r"\begin{table*}",
+                rf"\caption{{{_latex(title)}. {_latex(self.caption)}}}",
+                r"\resizebox{\textwidth}{!}{%",
                 rf"\begin{{tabular}}{{{'l' * 2}{'c' * (len(self.header) - 2)}}}",
                 r"\toprule",
                 lines[0],
                 r"\midrule",
                 *lines[1:],
                 r"\bottomrule",
-                r"\end{tabular}",
-                r"\end{table}",
+                r"\end{tabular}%",
+                "}",
+                r"\end{table*}",
                 "",
             ]
         )
@@ -65,13 +70,13 @@ class Table:
     def html(self) -> str:
         """The table as a section of HTML."""
         head, *body = (
-            "".join(f"<{kind}>{html.escape(text)}</{kind}>" for text in row)
+            "".join(f"<{kind}>{_html(text)}</{kind}>" for text in row)
             for kind, row in [("th", self.header), *(("td", row) for row in self.rows)]
         )
         rows = "\n".join(f"<tr>{row}</tr>" for row in body)
         return (
-            f"<section><h2>{html.escape(self.title)}</h2>\n<table><thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n"
-            f"</tbody></table>\n<p>{html.escape(self.caption)}</p></section>"
+            f"<section><h2>{_html(self.title)}</h2>\n<table><thead><tr>{head}</tr></thead>\n<tbody>\n{rows}\n"
+            f"</tbody></table>\n<p>{_html(self.caption)}</p></section>"
         )
 
 
@@ -207,7 +212,10 @@ TABLES: tuple[Callable[[Results], Table], ...] = (
 
 
 def _printed(number: paper.Printed | None) -> str:
-    return "-" if number is None else f"{number.mean:g} +- {number.spread:g}"
+    if number is None:
+        return "-"
+    n_digits = 0 if number.mean.is_integer() and number.spread.is_integer() else 1
+    return f"{number.mean:.{n_digits}f} +- {number.spread:.{n_digits}f}"
 
 
 def _spread(value: tuple[float, float] | None, scale: float) -> str:
@@ -227,10 +235,29 @@ def _with_tasks(results: Results, policy: str, tasks: Sequence[str], text: str) 
     return text if text == MISSING or len(there) == len(tasks) else f"{text} ({len(there)} of {len(tasks)} tasks)"
 
 
-_LATEX = {"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "+-": r"$\pm$"}
+def _html(text: str) -> str:
+    return html.escape(text).replace("+-", "±")
+
+
+_LATEX = str.maketrans(
+    {character: rf"\{character}" for character in "%_&#{}$"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$"}
+)
 
 
 def _latex(text: str) -> str:
-    for plain, escaped in _LATEX.items():
-        text = text.replace(plain, escaped)
-    return text
+    return text.translate(_LATEX).replace("+-", r"$\pm$")
+
+
+def _latex_cell(text: str) -> str:
+    """A cell, narrow: what follows a number is small beside it, how many tasks it is of above it."""
+    number, spread, deviation = text.partition(" +- ")
+    deviation, _, tasks = deviation.partition(" (")
+    if spread:
+        return rf"${number}_{{\pm {deviation}}}${_raised(tasks)}"
+    found = re.fullmatch(r"(-?[\d.]+) (\[.*\])(?: \((.*))?", text)
+    return rf"${found[1]}_{{{found[2]}}}${_raised(found[3])}" if found else _latex(text)
+
+
+def _raised(tasks: str | None) -> str:
+    return rf"\textsuperscript{{{tasks.removesuffix(')')}}}" if tasks else ""

@@ -107,7 +107,7 @@ def _load(checkpoint: Path) -> tuple[PointCloudPolicy, Any, Any]:
 
 
 def draw(moments: Moments, path: Path) -> None:
-    """A picture of each moment's cloud, coloured by saliency from dark to bright."""
+    """A picture of each moment's cloud, coloured by saliency from grey to red."""
     try:
         import matplotlib as mpl
 
@@ -115,19 +115,25 @@ def draw(moments: Moments, path: Path) -> None:
         from matplotlib import pyplot as plt
     except ImportError as error:
         raise UserError("Pictures need matplotlib: pip install 'lerobot_policy_uca_flow[pictures]'.") from error
+    colours = mpl.colors.LinearSegmentedColormap.from_list("saliency", ("#c4c9cf", "#f28c28", "#b00020"))
     n_moments = len(moments.steps)
-    figure = plt.figure(figsize=(4 * n_moments, 4))
+    figure = plt.figure(figsize=(4 * n_moments, 4.2), layout="constrained")
+    low, high = moments.points.min(axis=(0, 1)), moments.points.max(axis=(0, 1))
+    every: list[Any] = []
     for index, step in enumerate(moments.steps):
         axes: Any = figure.add_subplot(1, n_moments, index + 1, projection="3d")
-        order = np.argsort(moments.saliency[index])  # the brightest last, in front
+        order = np.argsort(moments.saliency[index])  # the greatest last, in front
         points, values = moments.points[index][order], moments.saliency[index][order]
-        axes.scatter(*points.T, c=values, s=6 + 24 * values, cmap="inferno", vmin=0, vmax=1)
+        shown = axes.scatter(*points.T, c=values, s=6 + 40 * values, cmap=colours, vmin=0, vmax=1, depthshade=False)
         axes.set_title(f"step {step}")
-        axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+        axes.set(xlabel="x [m]", ylabel="y [m]", xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+        axes.text2D(0.02, 0.85, "z [m] upwards", transform=axes.transAxes, fontsize=8)
         axes.set_aspect("equal")
         axes.locator_params(nbins=4)
         axes.view_init(elev=30, azim=-40)
-    figure.tight_layout()
+        every.append(axes)
+    figure.suptitle("Points that decide the predicted actions (grey: hardly, red: most of all at this step)")
+    figure.colorbar(shown, ax=every, shrink=0.7, label="influence, the step's greatest is 1")
     figure.savefig(path, dpi=100)
     plt.close(figure)
 
