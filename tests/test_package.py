@@ -286,6 +286,8 @@ for _ in range(2):
     result = load(f'import sys; sys.modules["{engine}"] = None', after)
     assert result.returncode == 0, result.stderr
     assert result.stderr.count(f"policy.inference={engine} needs the package {engine}") == 1
+    package = "'lerobot_policy_uca_flow[openvino]'" if engine == "openvino" else engine
+    assert f"To install it: pip install {package}\n" in result.stderr
 
 
 def test_a_type_that_another_plugin_has_registered_stays_theirs():

@@ -38,11 +38,13 @@ def make_backend(name: str) -> Callable[[Function], Function]:
     except ImportError as error:
         if name not in _warned:
             _warned.add(name)
+            package = (error.name or "openvino").partition(".")[0]
+            extra = "'lerobot_policy_uca_flow[openvino]'"  # with the versions that this package works with
             logger.warning(
                 "policy.inference=%s needs the package %s, which is not installed; PyTorch is used, which is slower. "
                 "To install it: pip install %s",
                 name,
                 error.name or error,
-                (error.name or "openvino").partition(".")[0],
+                extra if package == "openvino" else package,
             )
         return make_backend(EAGER)
