@@ -15,6 +15,8 @@ import matplotlib as mpl
 import pytest
 
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
+from tests.depth_builders import make_calibration, write_depth_dataset
+from tests.robots.test_calibrate import render_boards, write_points
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -29,6 +31,7 @@ NOT_RUN = {
     "accelerate launch": "tests/policies/test_distributed.py runs it, in two processes",
     "lerobot-train --policy.path=": "needs data under another name; tests/test_normalisation.py trains on some",
     "lerobot-uca-edit-dataset": "needs several episodes; tests/data/test_edit_dataset.py edits a dataset of three",
+    "lerobot-uca-view --camera.type=intelrealsense": "needs a camera; tests/robots shows the simulated one's",
     "lerobot-uca-benchmark run": "trains 37 tasks; tests/protocol/test_run.py runs a tiny one",
     "lerobot-uca-benchmark report": "needs that run's folder; tests/protocol/test_report.py makes one",
     "lerobot-uca-benchmark demonstrators": "runs 1850 episodes; tests/protocol/test_demonstrators.py runs two",
@@ -43,7 +46,9 @@ TINY = {
     "lerobot-uca-collect": ["--n_episodes=1", *TINY_CLOUD],
     "lerobot-train": ["--steps=2", "--batch_size=4", "--num_workers=0"],
     "lerobot-eval": ["--eval.n_episodes=1", "--eval.batch_size=1", "--eval.use_async_envs=false", *TINY_CLOUD],
+    "lerobot-uca-calibrate": [],
     "lerobot-uca-convert": ["--n_points=32"],
+    "lerobot-uca-view": ["--calibration=recorded_with", "--output=cloud.png"],
     "lerobot-uca-export": [],
     "benchmarks/control_loop.py": ["--steps=3", "--tasks", "dial-turn"],
     "benchmarks/fit.py": [],
@@ -59,9 +64,9 @@ TINY = {
 
 
 def commands_of(page: Path) -> list[str]:
-    """The commands of a page's ```bash blocks, continued lines joined, without comments."""
+    """The commands of a page's ```bash blocks, also those in lists, continued lines joined, without comments."""
     commands = []
-    for block in re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
+    for block in re.findall(r"^ *```bash\n(.*?)^ *```", page.read_text(), re.DOTALL | re.MULTILINE):
         for line in block.replace("\\\n", " ").splitlines():
             command = shlex.join(shlex.split(line, comments=True))
             commands += [command] if command else []
@@ -89,6 +94,8 @@ def tiny(command: str) -> tuple[str, list[str]]:
     if program == "python":
         program, *arguments = arguments
     changes = list(TINY[program])
+    if "data/recorded" in command and program == "lerobot-uca-convert":
+        changes.append("--calibration=recorded_with")  # another camera's than the one that is calibrated above it
     if program == "lerobot-train":
         changes += TINY_SIMPLE_DP3 if "simple_dp3" in command else TINY_UCA_FLOW
     return program, [*arguments, *changes]
@@ -96,7 +103,7 @@ def tiny(command: str) -> tuple[str, list[str]]:
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory) -> Path:
-    """A folder with the repository's scripts and, if they are there, Adroit's experts."""
+    """A folder with the repository's scripts, a user's recordings and, if they are there, Adroit's experts."""
     folder = tmp_path_factory.mktemp("docs")
     for name in ("benchmarks", "examples", "configs"):
         (folder / name).symlink_to(ROOT / name)
@@ -104,6 +111,10 @@ def workspace(tmp_path_factory) -> Path:
     if experts.is_dir():
         (folder / "experts").symlink_to(experts)
         (folder / "door.npz").symlink_to(experts / "door.npz")
+    write_points(folder / "touched.csv", pixels=True)
+    render_boards(folder / "board", on_arm=False)
+    write_depth_dataset(folder / "data" / "recorded", video=False, n_episodes=1)
+    make_calibration().write(folder / "recorded_with")
     return folder
 
 

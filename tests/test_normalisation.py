@@ -138,13 +138,18 @@ def test_held_out_episodes_do_not_count(dataset_root, tmp_path):
     np.testing.assert_allclose(stats[f"{STATE}.max"], columns(dataset_root, STATE, [0]).max(axis=0), rtol=1e-6)
 
 
-def test_leaving_out_the_episode_with_a_nan_trains(tmp_path):
+@pytest.mark.parametrize("pictures", [False, True])  # with some, LeRobot reads row by row
+def test_leaving_out_the_episode_with_a_nan_trains(tmp_path, pictures):
     def spoil(frame, episode, index):
+        if pictures:
+            frame["observation.images.top"] = np.zeros((8, 8, 3), np.uint8)
         if (episode, index) == (1, 4):
             frame[OBS_POINT_CLOUD][3, 1] = np.nan
 
-    write_dataset(tmp_path / "data", change=spoil)
-    with pytest.raises(UserError, match=r"values NaN or infinite in episode 1, frame 4. --dataset.episodes=\[0,2\]"):
+    picture = {"dtype": "image", "shape": (8, 8, 3), "names": ["height", "width", "channels"]}
+    given = features(OBS_POINT_CLOUD) | ({"observation.images.top": picture} if pictures else {})
+    write_dataset(tmp_path / "data", features=given, change=spoil)
+    with pytest.raises(UserError, match=r"in episode 1, frame 4\. --dataset\.episodes=\[0,2\]"):
         train(tmp_path / "data", tmp_path / "all")
     stats = saved(train(tmp_path / "data", tmp_path / "new", dataset={"episodes": [0, 2]}))
     assert all(torch.isfinite(value).all() for value in stats.values())
@@ -210,13 +215,14 @@ def test_colours_that_are_missing(dataset_root, checkpoint, tmp_path):
         pre(make_observation())
 
 
-def test_invalid_points_count_nowhere(tmp_path):
+@pytest.mark.parametrize("shape", [(N_POINTS,), (N_POINTS, 1)])
+def test_invalid_points_count_nowhere(tmp_path, shape):
     def mask(frame, *_):
         frame["observation.pointcloud.valid_mask"][:] = True
         frame["observation.pointcloud.valid_mask"][5:9] = False
         frame["observation.pointcloud.xyz"][5:9] = np.nan
 
-    of_mask = {"dtype": "bool", "shape": (N_POINTS,), "names": None}
+    of_mask = {"dtype": "bool", "shape": shape, "names": None}
     both = {**features("observation.pointcloud.xyz"), "observation.pointcloud.valid_mask": of_mask}
     write_dataset(tmp_path / "data", features=both, change=mask)
     trained = train(tmp_path / "data", tmp_path / "new")

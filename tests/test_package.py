@@ -21,6 +21,7 @@ ALLOWED = {
     "objectives": {"meanflow", "networks"},
     "bounds": {"errors"},
     "hub": {"errors"},
+    "processes": {"errors"},
     "policies": {
         *("bounds", "meanflow", "objectives", "networks", "inference", "point_clouds"),
         *("errors", "features", "hub", "registry"),
@@ -261,6 +262,23 @@ assert get_policy_class("uca_flow").__name__ == "UCAFlowPolicy"
     result = load(before, after)
     assert result.returncode == 0, result.stderr
     assert "lerobot_uca.envs.configs is not available" in result.stderr
+
+
+def test_a_broken_patch_never_takes_another_one_down():
+    before = """
+import lerobot_uca.lerobot_patches as patches
+def check_settings():
+    raise AttributeError("module 'lerobot' has no attribute 'gone'")
+patches.check_settings = check_settings
+"""
+    after = """
+from lerobot.datasets import factory
+assert hasattr(factory.LeRobotDataset, "__getitems__")
+"""
+    result = load(before, after)
+    assert result.returncode == 0, result.stderr
+    assert "lerobot_patches.check_settings is missing: AttributeError: module 'lerobot' has no" in result.stderr
+    assert result.stderr.count("is missing") == 1
 
 
 @pytest.mark.parametrize("engine", ["openvino", "onnxruntime"])

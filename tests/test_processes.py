@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_uca.errors import UserError
 from lerobot_uca.processes import worker_pool
 
 HEED = (
@@ -101,3 +102,8 @@ def test_workers_end_with_their_parent_also_by_kill(tmp_path):
             assert wait([connection], timeout=30)
             with pytest.raises(EOFError):
                 connection.recv()
+
+
+def test_a_worker_that_is_killed_is_one_line():
+    with pytest.raises(UserError, match="A worker process was ended from outside"), worker_pool(1) as pool:
+        pool.submit(os._exit, 9).result()

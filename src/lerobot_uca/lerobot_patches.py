@@ -82,23 +82,27 @@ logger = logging.getLogger(__name__)
 
 
 def install() -> None:
-    """Apply all patches. A second call changes nothing."""
-    report_user_errors()
+    """Apply all patches, each for itself. A second call changes nothing."""
+    patches = [report_user_errors, shorten_decoder_warning, make_registered_steps_only]
     if Path(sys.argv[0]).stem.startswith("lerobot"):  # one of LeRobot's commands, not somebody's own program
-        end_by_signals()
-    shorten_decoder_warning()
-    make_registered_steps_only()
-    if not is_supported():
-        return
-    check_settings()
-    find_configs_by_name()
-    read_in_batches()
-    report_damaged_checkpoints()
-    save_checkpoints_whole()
-    resume_exactly()
-    report_failed_uploads()
-    normalise_what_is_trained()
-    record_what_can_be_trained()
+        patches.append(end_by_signals)
+    if is_supported():
+        patches += [
+            check_settings,
+            find_configs_by_name,
+            read_in_batches,
+            report_damaged_checkpoints,
+            save_checkpoints_whole,
+            resume_exactly,
+            report_failed_uploads,
+            normalise_what_is_trained,
+            record_what_can_be_trained,
+        ]
+    for patch in patches:
+        try:
+            patch()
+        except Exception as error:  # noqa: BLE001 (one that fails must not take the others down)
+            logger.warning("lerobot_patches.%s is missing: %s: %s", patch.__name__, type(error).__name__, error)
 
 
 def report_user_errors() -> None:

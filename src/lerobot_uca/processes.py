@@ -8,11 +8,14 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from types import FrameType, TracebackType
 from weakref import WeakSet
+
+from lerobot_uca.errors import UserError
 
 
 def end_by_signals() -> None:
@@ -108,6 +111,9 @@ def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of worker processes. When it is left, what they are doing is finished, and what waits is dropped.
 
     They end with this process, however that ends.
+
+    Raises:
+        UserError: if one of them was ended from outside.
     """
     context = multiprocessing.get_context("forkserver")
     pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=_end_with_parent)
@@ -116,6 +122,8 @@ def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
             for _ in range(n_workers):
                 pool.submit(os.getpid)  # which starts a worker, as none is idle yet
         yield pool
+    except BrokenProcessPool as error:
+        raise UserError("A worker process was ended from outside; was there too little memory?") from error
     finally:
         pool.shutdown(cancel_futures=True)
 

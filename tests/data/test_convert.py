@@ -354,6 +354,110 @@ def test_wrong_sources(tmp_path, depth_dataset, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
+def damage_zarr(path, key, **changes):
+    group = pytest.importorskip("zarr").open_group(str(path), mode="a")
+    del group[key]
+    group.create_array(key, **changes)
+
+
+def damage_chunk(path):
+    chunk = next(file for file in sorted((path / "data" / "state").iterdir()) if not file.name.startswith("."))
+    chunk.write_bytes(b"\xff" * chunk.stat().st_size)
+
+
+DAMAGE = {
+    "a chunk": (damage_chunk, "data/state cannot be read"),
+    "text": (lambda path: damage_zarr(path, "data/state", data=np.full((12, 2), "a")), "data/state must hold real nu"),
+    "complex": (
+        lambda path: damage_zarr(path, "data/point_cloud", data=np.ones((12, 600, 3), complex)),
+        "data/point_cloud must hold real numbers, got complex128",
+    ),
+    "episode_ends of two dimensions": (
+        lambda path: damage_zarr(path, "meta/episode_ends", data=np.array([[5, 12]])),
+        "meta/episode_ends must be whole numbers",
+    ),
+    "episode_ends with fractions": (
+        lambda path: damage_zarr(path, "meta/episode_ends", data=np.array([4.5, 12])),
+        "meta/episode_ends must be whole numbers",
+    ),
+    "states of two dimensions": (
+        lambda path: damage_zarr(path, "data/state", data=np.ones((12, 2, 3), np.float32)),
+        r"data/state must have shape \(steps, numbers\), got \(12, 2, 3\)",
+    ),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGE.values(), ids=DAMAGE)
+def test_a_damaged_zarr_is_one_line(tmp_path, damage, message):
+    write_zarr(tmp_path / "a.zarr")
+    damage(tmp_path / "a.zarr")
+    with pytest.raises(UserError, match=message):
+        convert(config(tmp_path / "a.zarr", tmp_path / "clouds", fps=5))
+    assert not (tmp_path / "clouds").exists()
+
+
+def replace_row(folder, row):
+    lines = (folder / "frames.csv").read_text().splitlines()
+    (folder / "frames.csv").write_text("\n".join([*lines[:-1], row]) + "\n")
+
+
+DAMAGED_FILES = {
+    "truncated": (
+        lambda folder: (folder / "1.npz").write_bytes((folder / "1.npz").read_bytes()[:500]),
+        "cannot be",
+    ),
+    "empty": (lambda folder: (folder / "1.npz").write_bytes(b""), "cannot be read"),
+    "text": (lambda folder: np.savez(folder / "1.npz", points=np.full((200, 3), "a")), "must be real numbers, got <U1"),
+    "complex": (lambda folder: np.savez(folder / "1.npz", points=np.ones((200, 3), complex)), "must be real numbers"),
+    "a short row": (
+        lambda folder: replace_row(folder, "3.npz,1"),
+        "for each column in each row, row 5 has not",
+    ),
+    "a long row": (lambda folder: replace_row(folder, "3.npz,1,a,1,2,3,4,5,6"), "row 5 has not"),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), DAMAGED_FILES.values(), ids=DAMAGED_FILES)
+def test_a_damaged_file_is_one_line(tmp_path, damage, message):
+    write_folder(tmp_path / "recorded", "npz")
+    damage(tmp_path / "recorded")
+    with pytest.raises(UserError, match=message):
+        convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5))
+
+
+def test_a_spreadsheets_frames_csv_is_read(tmp_path):
+    write_folder(tmp_path / "recorded", "npz")
+    file = tmp_path / "recorded" / "frames.csv"
+    file.write_text(file.read_text(), encoding="utf-8-sig")
+    assert convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5)).num_episodes == 2
+
+
+def test_states_that_are_not_numbers_are_said(tmp_path, caplog):
+    write_folder(tmp_path / "recorded", "npz")
+    replace_row(tmp_path / "recorded", "3.npz,1,task,nan,0,0,0,0")
+    convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5))
+    assert "The state of the episodes [1] holds NaN or infinite values; training refuses them." in caplog.messages
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_clouds_converted_again_are_as_many_points_on_the_robot(depth_dataset, tmp_path, caplog):
+    convert(config(depth_dataset.root, tmp_path / "clouds"))
+    again = config(tmp_path / "clouds", tmp_path / "fewer", n_points=16, crop_low=None, crop_high=None, fps=7, task="a")
+    dataset = convert(again)
+    recipe = CloudRecipe.from_dict(dataset.features[OBS_POINT_CLOUD]["info"][RECIPE_INFO])
+    assert recipe.n_points == dataset.features[OBS_POINT_CLOUD]["shape"][0] == 16
+    assert (dataset.fps, dataset[0]["task"]) == (20, "push")
+    assert "--fps and --task are for sources without them; a LeRobot dataset keeps its own." in caplog.messages
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_a_report_without_matplotlib_is_refused_before_the_work(depth_dataset, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setattr(command, "make_source", lambda _: pytest.fail("the work has begun"))
+    with pytest.raises(UserError, match="needs matplotlib"):
+        convert(config(depth_dataset.root, tmp_path / "clouds", report=tmp_path / "report"))
+
+
 def test_a_crop_that_leaves_nothing_says_what_it_covers(depth_dataset, tmp_path, calibrated):
     elsewhere = {"crop_low": (0.2, 5.0, 0.01), "crop_high": (0.9, 6.0, 0.4)}
     with pytest.raises(

@@ -245,6 +245,16 @@ def test_inputs_of_other_dtypes_are_computed_in_float32(exported):
     np.testing.assert_array_equal(policy.plan(*(values.astype(np.float64) for values in inputs)), expected)
 
 
+def test_further_channels_are_left_out_and_said_once(exported, caplog):
+    random = np.random.default_rng(0)
+    cloud, state = random.normal(size=(N_POINTS, 6)).astype(np.float32), np.zeros(N_STATES, np.float32)
+    cloud[0, 5] = np.nan
+    policy, other = OnnxPolicy(exported, seed=0), OnnxPolicy(exported, seed=0)
+    np.testing.assert_array_equal(policy.select_action(cloud, state), other.select_action(cloud[:, :3], state))
+    policy.select_action(cloud, state)
+    assert caplog.messages == ["The cloud has 6 channels: the first 3 are taken."]
+
+
 class Diverged(torch.nn.Module):
     def forward(self, point_cloud, state, noise):
         return (noise + point_cloud.sum() + state.sum()) * torch.inf

@@ -32,11 +32,11 @@ def calibration(**changes):
 # Files --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("changes", [{}, {"frame": "tool", "depth_unit": 2.5e-4, "serial": ""}])
+@pytest.mark.parametrize("changes", [{}, {"frame": "tool", "depth_unit": 2.5e-4}])
 def test_a_file_holds_everything(tmp_path, changes):
     written = calibration(**changes)
     file = written.write(tmp_path / "new")
-    assert file.name == ("front.yaml" if changes else "123456.yaml")
+    assert file.name == ("123456.yaml")
     assert read_calibrations(tmp_path / "new") == {"front": written}
 
 
@@ -66,6 +66,11 @@ WRONG = {
     "unit": ({"depth_unit": 1000}, "depth_unit must be metres a unit"),
     "frame": ({"frame": "world"}, "frame must be one of base, tool, got 'world'"),
     "residual": ({"residual": 3}, "needs camera, intrinsics"),
+    "infinite width": (
+        {"intrinsics": {"width": np.inf, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240}},
+        "needs camera, intrinsics",
+    ),
+    "no serial": ({"serial": ""}, "must name its camera's serial"),
 }
 
 
@@ -198,6 +203,20 @@ def test_a_tool_that_turns_about_one_axis_is_refused(on_arm):
         X[:3, :3] = Rotation.from_rotvec([0, 0, angle]).as_matrix()
     with pytest.raises(CalibrationError, match=r"by at least 10 degrees about two axes, got 0\.0 about the second"):
         fit_board(X_base_tool, seen, on_arm=on_arm)
+
+
+def test_data_that_do_not_belong_together_are_refused():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.3, 0.3, (12, 3))
+    with pytest.raises(CalibrationError, match=r"at most 20 mm and 5 deg, got \d+.\d mm. Are the rows of both frames"):
+        fit_points(points, points[::-1])
+    with pytest.raises(CalibrationError, match="The residual must be"):
+        fit_points(points, points * (1, 1, -1))  # mirrored
+    _, tool, seen = boards(rng, on_arm=False)
+    with pytest.raises(CalibrationError, match="metres and radians"):
+        fit_board(tool, seen[::-1], on_arm=False)
+    with pytest.raises(CalibrationError, match="on_arm, true here, right"):
+        fit_board(tool, seen, on_arm=True)
 
 
 def test_too_few_poses():

@@ -1,5 +1,6 @@
 """Policies that see depth images: the same clouds in training, resumed, trained further, and on the robot."""
 
+import dataclasses
 import sys
 
 import numpy as np
@@ -26,7 +27,8 @@ from tests.depth_builders import (
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.depth import DepthToCloud
-from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, CloudRecipe, camera_of
+from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, RECIPE_INFO, CloudRecipe, camera_of
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.depth_config import DepthConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
@@ -330,6 +332,52 @@ def test_training_further_on_another_installations_data_is_refused(tiff, calibra
     monkeypatch.setenv(CALIBRATION_VARIABLE, str(other))
     further.depth.calibration = None
     assert train(tiff, tmp_path / "further2", further).is_dir()
+
+
+def features_made_with(recipe):
+    info = {} if recipe is None else {RECIPE_INFO: recipe.as_dict()}
+    return {OBS_POINT_CLOUD: {"dtype": "float32", "shape": (N_CLOUD_POINTS, 3), "info": info}}
+
+
+def test_training_further_on_other_clouds_makes_those_from_now_on_and_says_so(caplog):
+    depth = DepthConfig(recipe=make_recipe().as_dict())
+    other = dataclasses.replace(make_recipe(), crop=Crop((0.1, -0.3, 0.01), (0.9, 0.35, 0.4)), n_points=20)
+    assert depth.settle(features_made_with(make_recipe())) == make_recipe()
+    assert not caplog.messages
+    assert depth.settle(features_made_with(other)) == other
+    assert depth.recipe == other.as_dict()
+    (message,) = caplog.messages
+    assert "the crop is [0.1, -0.3, 0.01] to [0.9, 0.35, 0.4] and was [0.2, -0.3, 0.01] to" in message
+    assert "a cloud has 20 points and had 48" in message
+    caplog.clear()
+    assert depth.settle(features_made_with(None)) == other
+    assert "does not say how its clouds were made" in caplog.text
+
+
+def test_the_robot_makes_the_clouds_of_the_further_training(tmp_path, monkeypatch):
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+    trained = make_config(depth=DepthConfig(recipe=make_recipe().as_dict()))
+    for processors in make_processors(trained, make_statistics()):
+        processors.save_pretrained(tmp_path)
+    other = dataclasses.replace(make_recipe(), n_points=20)
+    trained.depth.settle(features_made_with(other))
+    preprocess, _ = make_pre_post_processors(trained, pretrained_path=str(tmp_path))
+    (there,) = [each for each in preprocess.steps if isinstance(each, DepthToCloudProcessorStep)]
+    cloud = there.observation({DEPTH_KEY: live_frame(0)})[OBS_POINT_CLOUD].numpy()
+    np.testing.assert_array_equal(cloud, pure_cloud(0, other))
+
+
+def test_another_device_is_said(calibrated, caplog):
+    make_calibration(serial="654321").write(calibrated)
+    (calibrated / "123456.yaml").unlink()
+    step()
+    assert "camera 'front' is the device 654321 and was 123456" in caplog.text
+
+
+def test_depth_of_a_type_that_numpy_lacks():
+    picture = torch.full((1, 1, 48, 64), 700, dtype=torch.bfloat16)
+    expected = step().observation({DEPTH_KEY: picture.float()})[OBS_POINT_CLOUD]
+    assert torch.equal(step().observation({DEPTH_KEY: picture})[OBS_POINT_CLOUD], expected)
 
 
 def test_a_policy_trained_on_unknown_clouds_does_not_take_depth(tiff, calibrated, dataset_root, tmp_path):

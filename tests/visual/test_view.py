@@ -152,6 +152,16 @@ def test_wrong_input(depth_dataset, tmp_path, monkeypatch):
             next(view(config))
 
 
+@pytest.mark.usefixtures("calibrated")
+def test_what_cannot_be_shown_is_one_line(depth_dataset, tmp_path):
+    with pytest.raises(UserError, match="Give both crop_low and crop_high"):
+        list(view(ViewConfig(source=depth_dataset.root, crop_low=(0, 0, 0), output=tmp_path / "a.png")))
+    with pytest.raises(UserError, match=r"Cannot write '.*none/a.rrd'"):
+        list(view(ViewConfig(source=depth_dataset.root, rrd=tmp_path / "none" / "a.rrd")))
+    with pytest.raises(UserError, match="The first frame has no point"):
+        command.crop_of(ViewConfig(source=depth_dataset.root), np.empty((0, 3), np.float32))
+
+
 def test_without_a_crop_the_box_of_the_points_is_shown():
     points = np.random.default_rng(0).uniform(0, 1, (1000, 3)).astype(np.float32)
     crop = command.crop_of(ViewConfig(), points)

@@ -37,26 +37,30 @@ def chosen_statistics(dataset: Any, masks: Masks) -> Statistics:
     columns = _columns(dataset)
     for key, mask in masks.items():
         if mask is not None and columns is not None and key in stats:
-            stats = {**stats, key: _point_statistics(columns.tensors[key][columns.tensors[mask].bool()].numpy())}
+            valid = columns.tensors[mask].flatten(1).bool()
+            stats = {**stats, key: _point_statistics(columns.tensors[key][valid].numpy())}
     return {key: stats[key] for key in masks if key in stats}
 
 
 def check_finite(dataset: Any, masks: Masks) -> None:
     """Raise a `UserError` that names episode and frame if a value of the chosen episodes is NaN or infinite.
 
-    A cloud without valid points is refused, too. If the dataset is not read in batches, only the statistics are
-    checked, which name the episode alone.
+    A cloud without valid points is refused, too, if the dataset is read in batches. Otherwise the statistics are
+    checked, and rows only to name the frame.
     """
     columns = _columns(dataset)
     if columns is None:
         for episode, stats in _episode_statistics(dataset, masks).items():
             for key, of_key in stats.items():
                 if not all(np.isfinite(each).all() for each in of_key.values()):
-                    raise UserError(f"'{key}' must be finite, got NaN or infinite values in episode {episode}.")
+                    raise UserError(
+                        f"'{key}' must be finite, got NaN or infinite values in episode {episode}, frame "
+                        f"{_first_bad_frame(dataset, key, episode)}. {_without([episode], dataset)}"
+                    )
         return
     for key, mask in masks.items():
         values = columns.tensors[key]
-        valid = torch.ones(len(values), 1) if mask is None else columns.tensors[mask]
+        valid = torch.ones(len(values), 1) if mask is None else columns.tensors[mask].flatten(1)
         empty = (~valid.bool().any(dim=1)).nonzero().flatten()
         if len(empty):
             raise UserError(
@@ -73,6 +77,13 @@ def check_finite(dataset: Any, masks: Masks) -> None:
             )
 
 
+def _first_bad_frame(dataset: Any, key: str, episode: int) -> int:
+    for row in dataset.hf_dataset.select_columns([key, "episode_index", "frame_index"]):
+        if int(row["episode_index"]) == episode and not torch.isfinite(torch.as_tensor(row[key])).all():
+            return int(row["frame_index"])
+    raise AssertionError(f"The statistics of episode {episode} are not those of its rows.")
+
+
 def _bad(values: Tensor, valid: Tensor) -> Tensor:
     """Rows (R, ...) of values, and which of their points are valid (R, N) or (R, 1), to what is bad, (R, values)."""
     bad = ~torch.isfinite(values).reshape(len(values), valid.shape[1], -1)
@@ -81,12 +92,17 @@ def _bad(values: Tensor, valid: Tensor) -> Tensor:
 
 def _place(columns: Columns, rows: Tensor, dataset: Any) -> str:
     episodes = columns.tensors["episode_index"][rows].unique().tolist()
-    chosen = range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes
-    others = [episode for episode in chosen if episode not in set(episodes)]
     frame, episode = (int(columns.tensors[f"{name}_index"][rows[0]]) for name in ("frame", "episode"))
     more = f" and in {len(rows) - 1} more frames, of the episodes {episodes[:MAX_LISTED]}" if len(rows) > 1 else ""
+    return f"episode {episode}, frame {frame}{more}. {_without(episodes, dataset)}"
+
+
+def _without(episodes: list[int], dataset: Any) -> str:
+    """A sentence that says how to train without some episodes."""
+    chosen = range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes
+    others = [episode for episode in chosen if episode not in set(episodes)]
     option = str(others).replace(" ", "") if len(others) <= MAX_LISTED else "[...]"
-    return f"episode {episode}, frame {frame}{more}. --dataset.episodes={option} leaves these episodes out."
+    return f"--dataset.episodes={option} leaves these episodes out."
 
 
 def _columns(dataset: Any) -> Columns | None:

@@ -1,8 +1,9 @@
 """A report on the quality of recorded clouds: numbers as text, and a picture."""
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,17 @@ class EpisodeReport(NamedTuple):
     seen: str  # of the first frame with too few points, what part of the scene the crop covers
 
 
+def require_pictures() -> Any:
+    """The figures of matplotlib, or a `UserError`: asked for before the work, at whose end the report stands."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise UserError(
+            "The report's picture needs matplotlib: pip install 'lerobot_policy_uca_flow[pictures]'."
+        ) from error
+    return Figure
+
+
 def write_report(folder: Path, episodes: Sequence[EpisodeReport], least: int) -> None:
     """Write report.txt and report.png into a folder.
 
@@ -31,10 +43,18 @@ def write_report(folder: Path, episodes: Sequence[EpisodeReport], least: int) ->
         episodes: at least one.
         least: a frame with fewer points is too empty.
     """
+    picture = io.BytesIO()
+    _draw(picture, episodes, least)
+    text = "\n".join(summarise(episodes, least)) + "\n"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "report.txt").write_text("\n".join(summarise(episodes, least)) + "\n", encoding="utf-8")
-        _draw(folder / "report.png", episodes, least)
+        for name, content in (("report.txt", text.encode()), ("report.png", picture.getvalue())):
+            unfinished = folder / f".{name}.unfinished"
+            try:
+                unfinished.write_bytes(content)
+                unfinished.replace(folder / name)
+            finally:
+                unfinished.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"Cannot write the report: {error}") from error
 
@@ -74,14 +94,8 @@ def _numbers(values: NDArray[np.float32]) -> str:
     return "[" + ", ".join(f"{value:.3g}" for value in values) + "]"
 
 
-def _draw(file: Path, episodes: Sequence[EpisodeReport], least: int) -> None:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise UserError(
-            "The report's picture needs matplotlib: pip install 'lerobot_policy_uca_flow[pictures]'."
-        ) from error
-    figure = Figure(figsize=(10, 6), layout="constrained")
+def _draw(file: IO[bytes], episodes: Sequence[EpisodeReport], least: int) -> None:
+    figure = require_pictures()(figsize=(10, 6), layout="constrained")
     points_axes, invalid_axes = figure.subplots(2, 1, sharex=True)
     points_axes.plot(np.concatenate([each.n_points for each in episodes]), linewidth=0.8)
     points_axes.axhline(least, color="tab:red", linewidth=0.8, label=f"least, {least}")

@@ -7,7 +7,7 @@ Example:
 import importlib.metadata
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_uca.bounds import check_bounds, within
-from lerobot_uca.data.cloud_report import EpisodeReport, write_report
+from lerobot_uca.data.cloud_report import EpisodeReport, require_pictures, write_report
 from lerobot_uca.data.sources.find import find_source
 from lerobot_uca.data.sources.lerobot_source import LeRobotSource
 from lerobot_uca.data.sources.source import Source
@@ -106,7 +106,11 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
     except HFValidationError as error:
         raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
     check_bounds(config)
+    if config.report is not None:
+        require_pictures()
     source = make_source(config)
+    if isinstance(source, LeRobotSource) and (config.fps is not None or config.task):
+        logger.warning("--fps and --task are for sources without them; a LeRobot dataset keeps its own.")
     fps = source.fps or config.fps
     if fps is None:
         raise UserError(f"'{config.source}' does not say how many steps a second it has: give --fps.")
@@ -195,6 +199,7 @@ def _write(config: ConvertConfig, source: Source, fps: int, episodes: list[int],
             dataset.finalize()  # closes its files, which would otherwise come back when they are garbage-collected
     if config.report is not None:
         write_report(config.report, reports, least)
+    _warn_of_nan(reports)
     for report in reports:
         few = np.flatnonzero(report.n_points < least)
         if len(few):
@@ -203,6 +208,13 @@ def _write(config: ConvertConfig, source: Source, fps: int, episodes: list[int],
                 f"points inside the crop, the first is frame {few[0]} with {report.n_points[few[0]]}. {report.seen}. "
                 "Move the crop, or leave the episode out with --episodes; --report=FOLDER shows all."
             )
+
+
+def _warn_of_nan(reports: list[EpisodeReport]) -> None:
+    for name in ("state", "action"):
+        bad = [report.episode for report in reports if not np.isfinite(getattr(report, name)).all()]
+        if bad:
+            logger.warning("The %s of the episodes %s holds NaN or infinite values; training refuses them.", name, bad)
 
 
 def _converted(config: ConvertConfig, source: Source, episodes: list[int]) -> Iterator[Episode]:
@@ -236,7 +248,7 @@ def _features(config: ConvertConfig, source: Source, episode: Episode) -> dict[s
         }
     }
     if recipe is not None:
-        info[RECIPE_INFO] = recipe.as_dict()
+        info[RECIPE_INFO] = replace(recipe, n_points=config.n_points).as_dict()
     return {
         OBS_POINT_CLOUD: {
             "dtype": "float32",

@@ -4,7 +4,6 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 
 from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
-from lerobot_uca.errors import UserError
 from lerobot_uca.processes import worker_pool
 
 
@@ -54,16 +52,13 @@ def demonstrations(
     n_workers = os.cpu_count() or 1
     pending: deque[Future[Demonstration]] = deque()
     n_missing = n_wanted
-    try:
-        with worker_pool(n_workers) as pool:
-            while n_missing:
-                # Never more than may still be needed: leaving the pool waits for running episodes.
-                n_idle = max(0, min(n_missing, n_workers + 1) - len(pending))
-                pending.extend(pool.submit(demonstrate, env_factory, attempt) for attempt in islice(attempts, n_idle))
-                if not pending:
-                    return
-                episode = pending.popleft().result()
-                n_missing -= episode.is_successful
-                yield episode
-    except BrokenProcessPool as error:
-        raise UserError("A process that ran an expert was ended from outside; was there too little memory?") from error
+    with worker_pool(n_workers) as pool:
+        while n_missing:
+            # Never more than may still be needed: leaving the pool waits for running episodes.
+            n_idle = max(0, min(n_missing, n_workers + 1) - len(pending))
+            pending.extend(pool.submit(demonstrate, env_factory, attempt) for attempt in islice(attempts, n_idle))
+            if not pending:
+                return
+            episode = pending.popleft().result()
+            n_missing -= episode.is_successful
+            yield episode

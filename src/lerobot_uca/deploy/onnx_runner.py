@@ -8,11 +8,14 @@ Letters: K steps from the first observed one to the current one, N points, S sta
 dimensions.
 """
 
+import logging
 from collections import deque
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
+
+logger = logging.getLogger(__name__)
 
 INPUTS = ("point_cloud", "state", "noise")
 MIN_ONNXRUNTIME = (1, 12)  # the first with opset 17
@@ -42,6 +45,7 @@ class OnnxPolicy:
         self._state_shape = shapes["state"][1:]
         self._noise_shape = shapes["noise"]
         self._random = np.random.default_rng(seed)
+        self._has_said = False
         self.reset()
 
     def reset(self) -> None:
@@ -55,6 +59,10 @@ class OnnxPolicy:
         The cloud is (N, 3), or (N, 6) if the policy sees colours. The first of more channels are taken. More points
         are sampled farthest point by farthest point, as the policy does.
         """
+        n_channels = np.shape(point_cloud)[-1] if np.ndim(point_cloud) == 2 else 0
+        if n_channels > self._cloud_shape[1] and not self._has_said:
+            self._has_said = True
+            logger.warning("The cloud has %d channels: the first %d are taken.", n_channels, self._cloud_shape[1])
         cloud = _sampled(point_cloud, *self._cloud_shape)
         frame = (_checked("point_cloud", cloud, self._cloud_shape), _checked("state", state, self._state_shape))
         self._history.extend([frame] * (1 if self._history else self._n_steps))
@@ -107,7 +115,7 @@ def check_version(version: str) -> None:
 
 def _sampled(point_cloud: np.ndarray, n_points: int, n_channels: int) -> np.ndarray:
     points = np.asarray(point_cloud, dtype=np.float32)
-    if points.ndim != 2 or points.shape[1] < n_channels or not np.isfinite(points).all():
+    if points.ndim != 2 or points.shape[1] < n_channels or not np.isfinite(points[:, :n_channels]).all():
         return points  # refused by the check that follows
     points = points[:, :n_channels]
     if len(points) <= n_points:

@@ -120,8 +120,10 @@ class TracedFunction(ABC):
 class _Weights:
     """A network's weights, to notice when one is changed in place or replaced, by `weight.data = ...` for example.
 
-    All are looked at, in every call. Two things stay unnoticed: PyTorch's fused optimisers, which change weights in
-    place without a trace of it (so the policies compute with averaged weights), and whole submodules that are replaced.
+    All are looked at, in every call, but not their values, which would take as long as the network. So what changes
+    weights in place without a trace stays unnoticed: `weight.data.copy_(...)` and others by way of `.data` or
+    `.numpy()`, and PyTorch's fused optimisers (so the policies compute with averaged weights); and a whole submodule
+    that is replaced.
     """
 
     def __init__(self, network: nn.Module) -> None:

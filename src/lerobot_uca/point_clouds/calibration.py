@@ -101,7 +101,7 @@ class Calibration:
             pose = np.array(values["pose"], dtype=np.float64)
             name, depth_unit = str(values["camera"]), float(values.get("depth_unit", MILLIMETRE))
             residual = {str(key): float(value) for key, value in (values.get("residual") or {}).items()}
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise CalibrationError(
                 f"{source} needs camera, intrinsics (width, height, fx, fy, cx, cy) and pose (4 x 4): "
                 f"{type(error).__name__} {error}."
@@ -118,7 +118,7 @@ class Calibration:
     def write(self, folder: Path) -> Path:
         """Write `folder/<serial>.yaml` and return it."""
         folder.mkdir(parents=True, exist_ok=True)
-        file = folder / f"{self.serial or self.camera.name}.yaml"
+        file = folder / f"{self.serial}.yaml"
         text = yaml.safe_dump(self.as_dict(), sort_keys=False, default_flow_style=None, width=110)
         unfinished = file.with_suffix(".unfinished")
         unfinished.write_text(HEADER + text, encoding="utf-8")
@@ -144,6 +144,8 @@ def read_calibrations(folder: Path) -> dict[str, Calibration]:
         if not isinstance(values, dict):
             raise CalibrationError(f"'{file}' must hold a calibration, got {type(values).__name__}.")
         calibration = Calibration.from_dict(values, source=f"'{file}'")
+        if not calibration.serial:
+            raise CalibrationError(f"'{file}' must name its camera's serial: another device is not calibrated by it.")
         name = calibration.camera.name
         if name in found:
             raise CalibrationError(f"'{folder}' must hold one calibration of camera '{name}', got two.")

@@ -95,8 +95,12 @@ class CloudRecipe:
         return replace(self, sources=tuple(sources))
 
     def differences(self, other: "CloudRecipe") -> list[str]:
-        """The differences between another recipe's cameras and this one's, for the same images, a line each."""
+        """The differences between another recipe and this one, for the same images, a line each."""
         lines = []
+        if self.crop != other.crop:
+            lines.append(f"the crop is {_corners(other.crop)} and was {_corners(self.crop)} m")
+        if self.n_points != other.n_points:
+            lines.append(f"a cloud has {other.n_points} points and had {self.n_points}")
         for mine, others in zip(self.sources, other.sources, strict=True):
             a, b = mine.calibration, others.calibration
             mm, deg = pose_difference(a.camera.X_world_camera, b.camera.X_world_camera)
@@ -109,6 +113,11 @@ class CloudRecipe:
                     lines.append(f"{what} of camera '{name}' is {now:g} and was {before:g} pixels")
             if a.depth_unit != b.depth_unit:
                 lines.append(f"a unit of camera '{name}' is {b.depth_unit:g} m and was {a.depth_unit:g} m")
+            if a.serial != b.serial:
+                lines.append(f"camera '{name}' is the device {b.serial or 'without a serial'} and was {a.serial}")
+            if (mine.near, mine.far) != (others.near, others.far):
+                was, is_now = (f"{each.near:g} to {each.far:g} m" for each in (mine, others))
+                lines.append(f"depth of camera '{name}' counts from {is_now} and did from {was}")
         return lines
 
     def as_dict(self) -> dict[str, Any]:
@@ -159,6 +168,10 @@ def make_crop(low: Iterable[float], high: Iterable[float]) -> Crop:
     if len(a) != 3 or len(b) != 3 or not all(x < y for x, y in zip(a, b, strict=True)):
         raise CalibrationError(f"A crop has corners (x, y, z) [m], low below high in each, got {a} and {b}.")
     return Crop((a[0], a[1], a[2]), (b[0], b[1], b[2]))
+
+
+def _corners(crop: Crop) -> str:
+    return f"{list(crop.low)} to {list(crop.high)}"
 
 
 def depth_source(key: str, info: Mapping[str, Any], calibration: Calibration) -> DepthSource:

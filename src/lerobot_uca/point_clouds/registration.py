@@ -16,6 +16,8 @@ MIN_SPREAD = 0.02
 """[m] Touched points must spread this far from a line (standard deviation), or the rotation about it is open."""
 MIN_ROTATION = 10.0
 """[deg] The tool must turn this far about two axes, or the pose along the axis it turns about is open."""
+MAX_MM, MAX_DEG = 20.0, 5.0
+"""Residuals above these are mistakes in the data: touched points and boards fit within a few millimetres."""
 
 
 class Fit(NamedTuple):
@@ -36,7 +38,8 @@ def fit_points(points_camera: Array, points_base: Array) -> Fit:
     """X_base_camera from the same P points in both frames, (P, 3) each: least squares (Kabsch 1976, Umeyama 1991).
 
     Raises:
-        CalibrationError: for fewer than 4 points, points on a line, or coordinates that are not finite.
+        CalibrationError: for fewer than 4 points, points on a line, coordinates that are not finite, and points that do
+            not fit.
     """
     a, b = np.asarray(points_camera, dtype=np.float64), np.asarray(points_base, dtype=np.float64)
     if a.shape != b.shape or a.ndim != 2 or a.shape[1] != 3 or not (np.isfinite(a).all() and np.isfinite(b).all()):
@@ -53,7 +56,8 @@ def fit_points(points_camera: Array, points_base: Array) -> Fit:
     U, _, Vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
     R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
     X = _pose(R, mean_b - R @ mean_a)
-    return Fit(X, 1e3 * np.linalg.norm(a @ R.T + X[:3, 3] - b, axis=1), np.empty(0))
+    fit = Fit(X, 1e3 * np.linalg.norm(a @ R.T + X[:3, 3] - b, axis=1), np.empty(0))
+    return _fitting(fit, "Are the rows of both frames the same points, in metres?")
 
 
 def fit_board(X_base_tool: Array, X_camera_board: Array, *, on_arm: bool) -> Fit:
@@ -64,7 +68,8 @@ def fit_board(X_base_tool: Array, X_camera_board: Array, *, on_arm: bool) -> Fit
     Martin's method. The residual is how far the board, which stands still in one of the two frames, moves in it.
 
     Raises:
-        CalibrationError: for fewer than 5 poses, or if the tool turned too little about a second axis.
+        CalibrationError: for fewer than 5 poses, if the tool turned too little about a second axis, and for poses that
+            do not fit.
     """
     import cv2  # slow to import
 
@@ -93,7 +98,20 @@ def fit_board(X_base_tool: Array, X_camera_board: Array, *, on_arm: bool) -> Fit
     mean = _mean_pose(boards)
     mm = 1e3 * np.linalg.norm(boards[:, :3, 3] - mean[:3, 3], axis=1)
     deg = np.array([rotation_angle(mean[:3, :3].T @ board[:3, :3]) for board in boards])
-    return Fit(X, mm, deg)
+    return _fitting(
+        Fit(X, mm, deg),
+        "Is each pose that of its picture, in metres and radians (a rotation vector), the board as it was printed, and "
+        f"on_arm, {str(on_arm).lower()} here, right?",
+    )
+
+
+def _fitting(fit: Fit, hint: str) -> Fit:
+    """The fit, or a `CalibrationError` for data that do not belong together."""
+    residual = fit.residual
+    if residual["mm"] > MAX_MM or residual.get("deg", 0) > MAX_DEG:
+        got = ", ".join(f"{value:.1f} {unit}" for unit, value in residual.items())
+        raise CalibrationError(f"The residual must be at most {MAX_MM:g} mm and {MAX_DEG:g} deg, got {got}. {hint}")
+    return fit
 
 
 def _second_axis(poses: Array) -> float:

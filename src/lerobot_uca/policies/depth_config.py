@@ -1,5 +1,6 @@
 """Options for a policy's cloud from a dataset's depth images, and the recipe that they become."""
 
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,8 @@ from lerobot_uca.point_clouds.recipe import (
     installed_calibrations,
     recipe_for,
 )
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -65,7 +68,7 @@ class DepthConfig:
         cloud_key = find_point_cloud(features)
         if cloud_key is not None:
             made_with = (features[cloud_key].get("info") or {}).get(RECIPE_INFO)
-            return kept or (CloudRecipe.from_dict(made_with) if made_with else None)
+            return _further(kept, CloudRecipe.from_dict(made_with) if made_with else None)
         keys = depth_keys(features)
         if not keys:
             return kept
@@ -80,6 +83,21 @@ class DepthConfig:
         if self.crop_low is None or self.crop_high is None:
             return None
         return self.crop_low, self.crop_high
+
+
+def _further(kept: CloudRecipe | None, made_with: CloudRecipe | None) -> CloudRecipe | None:
+    """The recipe of a checkpoint that is trained on clouds: theirs, since the robot's must become the same."""
+    if kept is None or made_with is None:
+        if kept is not None:
+            logger.warning("The dataset does not say how its clouds were made; the policy will make them as before.")
+        return kept or made_with
+    if kept.keys != made_with.keys:
+        differences = [f"the dataset's clouds are made from {', '.join(made_with.keys)}, not {', '.join(kept.keys)}"]
+    else:
+        differences = kept.differences(made_with)
+    if differences:
+        logger.warning("The policy will make clouds as the dataset's were made: %s.", "; ".join(differences))
+    return made_with
 
 
 def _check_same(kept: CloudRecipe, recipe: CloudRecipe) -> None:

@@ -92,6 +92,7 @@ def load_processors(
     processors = make(config, checkpoint, *args, **options, **overrides)
     for step in processors[0].steps:
         if isinstance(step, DepthToCloudProcessorStep):
+            step.recipe = config.depth.recipe or step.recipe  # a further training's, where that has another one
             step.install(config.depth.calibration)
     _check_pipelines(config, checkpoint, *processors)
     return processors
@@ -231,6 +232,8 @@ def _with_last_dimension(values: Tensor, cloud: Tensor) -> Tensor:
 
 def _with_valid_points(cloud: Tensor, mask: Tensor) -> Tensor:
     """Clouds (..., N, C) with the valid points of a mask (..., N) in their order, repeated in turn up to N."""
+    if mask.shape == (*cloud.shape[:-1], 1):
+        mask = mask.squeeze(-1)
     if mask.shape != cloud.shape[:-1]:
         raise UserError(f"The mask of valid points must have shape {tuple(cloud.shape[:-1])}, got {tuple(mask.shape)}.")
     n_valid = mask.sum(dim=-1, keepdim=True)

@@ -128,5 +128,7 @@ def _installed(trained: CloudRecipe, folder: str | None) -> CloudRecipe:
 
 
 def _as_array(image: Any) -> np.ndarray:
-    array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
+    if isinstance(image, Tensor):
+        image = (image.float() if image.dtype is torch.bfloat16 else image).detach().cpu().numpy()  # NumPy has none
+    array = np.asarray(image)
     return array[None] if array.ndim == 2 else array

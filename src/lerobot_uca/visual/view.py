@@ -110,12 +110,20 @@ def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
 
 
 def crop_of(config: ViewConfig, points: NDArray[np.float32]) -> Crop:
-    """The configured crop or, without one, the box of all points."""
+    """The configured crop or, without one, the box of all points.
+
+    Raises:
+        UserError: for a crop that cannot be, and without one for a cloud without points.
+    """
+    if (config.crop_low is None) != (config.crop_high is None):
+        raise UserError("Give both crop_low and crop_high, or neither.")
     if config.crop_low is not None and config.crop_high is not None:
         try:
             return make_crop(config.crop_low, config.crop_high)
         except CalibrationError as error:
             raise UserError(str(error)) from error
+    if not len(points):
+        raise UserError("The first frame has no point: give crop_low and crop_high, or look at another episode.")
     low, high = (np.round(np.percentile(points[:, :3], share, axis=0), 2).tolist() for share in (1, 99))
     return Crop((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
@@ -144,7 +152,10 @@ def record(file: Path, clouds: Iterator[NDArray[np.float32]], crop: Crop) -> Non
     except ImportError as error:
         raise UserError("Recordings need rerun-sdk: pip install 'lerobot_policy_uca_flow[view]'.") from error
     recording = rerun.RecordingStream("lerobot_uca")
-    recording.save(str(file))
+    try:
+        recording.save(str(file))
+    except (OSError, RuntimeError) as error:
+        raise UserError(f"Cannot write '{file}': {error}") from error
     for index, points in enumerate(clouds):
         recording.set_time("frame", sequence=index)
         recording.log("cloud", rerun.Points3D(points[:, :3], colors=colours_of(points, crop), radii=0.003))

@@ -1,6 +1,8 @@
 """Clouds in files: DP3's zarr, and folders of PLY or NPZ files."""
 
 import csv
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -42,9 +44,20 @@ class ZarrSource(Source):
             raise UserError(
                 f"'{self.path}' must hold {', '.join(ZARR_KEYS)}; {', '.join(missing)} is missing, got {found}."
             )
-        lengths = {key: group[key].shape[0] for key in ZARR_KEYS[:3]}
-        ends = np.asarray(group[ZARR_KEYS[3]])
-        shape = group[ZARR_KEYS[0]].shape
+        shapes = {key: group[key].shape for key in ZARR_KEYS}
+        kinds = {key: group[key].dtype for key in ZARR_KEYS}
+        if wrong := [key for key in ZARR_KEYS if kinds[key].kind not in "fiub" or not shapes[key]]:
+            raise UserError(f"'{self.path}': {wrong[0]} must hold real numbers, got {kinds[wrong[0]]}.")
+        ends = self._read(group, ZARR_KEYS[3])
+        if ends.ndim != 1 or kinds[ZARR_KEYS[3]].kind not in "iu":
+            raise UserError(
+                f"'{self.path}': meta/episode_ends must be whole numbers (episodes,), got {ends.dtype} {ends.shape}."
+            )
+        for key in ZARR_KEYS[1:3]:
+            if len(shapes[key]) > 2:
+                raise UserError(f"'{self.path}': {key} must have shape (steps, numbers), got {shapes[key]}.")
+        lengths = {key: shapes[key][0] for key in ZARR_KEYS[:3]}
+        shape, ends = shapes[ZARR_KEYS[0]], ends.astype(np.int64)
         if len({*lengths.values(), int(ends[-1]) if len(ends) else 0}) != 1 or np.any(np.diff(ends, prepend=0) <= 0):
             raise UserError(f"'{self.path}': meta/episode_ends must rise to the number of steps {lengths}, got {ends}.")
         if len(shape) != 3 or shape[2] < 3:
@@ -58,13 +71,19 @@ class ZarrSource(Source):
 
     def frames(self, episode: int) -> list[Frame]:
         """The steps of one episode."""
-        ends = np.asarray(self._group[ZARR_KEYS[3]])
+        ends = self._read(self._group, ZARR_KEYS[3])
         steps = slice(int(ends[episode - 1]) if episode else 0, int(ends[episode]))
-        columns = [np.asarray(self._group[key][steps], dtype=np.float32) for key in ZARR_KEYS[:3]]
+        columns = [self._read(self._group, key, steps).astype(np.float32) for key in ZARR_KEYS[:3]]
         return [
             Frame(*self._cropped(cloud), np.atleast_1d(state), np.atleast_1d(action), self.task)
             for cloud, state, action in zip(*columns, strict=True)
         ]
+
+    def _read(self, group: Any, key: str, steps: slice = slice(None)) -> NDArray[Any]:
+        try:
+            return np.asarray(group[key][steps])
+        except (OSError, RuntimeError, TypeError, ValueError) as error:  # of a damaged chunk, each codec its own
+            raise UserError(f"'{self.path}': {key} cannot be read: {' '.join(str(error).split())}") from error
 
     def left_out(self) -> list[str]:
         """Arrays that are not kept, and colours."""
@@ -92,10 +111,12 @@ class FolderSource(Source):
     def _rows(self) -> list[dict[str, str]]:
         file = self.path / "frames.csv"
         try:
-            with file.open(newline="", encoding="utf-8") as opened:
+            with file.open(newline="", encoding="utf-8-sig") as opened:  # spreadsheets write a mark at the beginning
                 rows = list(csv.DictReader(opened))
-        except (OSError, UnicodeDecodeError) as error:
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
             raise UserError(f"'{file}' cannot be read: {error}") from error
+        if uneven := [number for number, row in enumerate(rows, 2) if None in row or None in row.values()]:
+            raise UserError(f"'{file}' must have a value for each column in each row, row {uneven[0]} has not.")
         columns = list(rows[0]) if rows else []
         vectors = [self._columns(columns, kind) for kind in ("state", "action")]
         if not {"file", "episode"} <= set(columns) or not all(vectors):
@@ -139,7 +160,7 @@ class FolderSource(Source):
                 np.array([float(row[name]) for name in self._columns(list(row), kind)], dtype=np.float32)
                 for kind in ("state", "action")
             )
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
             raise UserError(f"'{file}' (frames.csv) cannot be read: {' '.join(str(error).split())}") from error
         if points.ndim != 2 or points.shape[1] < 3:
             raise UserError(f"'{file}' must hold points (N, 3 or more), got shape {points.shape}.")
@@ -161,7 +182,10 @@ def _read_ply(file: Path) -> NDArray[Any]:
 
 def _read_npz(file: Path) -> NDArray[Any]:
     with np.load(file, allow_pickle=False) as arrays:
-        return arrays["points"]
+        points: NDArray[Any] = arrays["points"]
+    if points.dtype.kind not in "fiu":
+        raise ValueError(f"'points' must be real numbers, got {points.dtype}")
+    return points
 
 
 READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".ply": _read_ply, ".npz": _read_npz}
