@@ -98,7 +98,7 @@ def test_rays_that_meet_corners_are_cast_at_every_triangle_around():
     triangles = [triangle(tuple(origin), *model.mesh_vert[face]) for face in model.mesh_face]
     expected = [min(at_triangle(tuple(direction), each)[0] for each in triangles) for direction in directions]
     np.testing.assert_allclose(hits.distance, expected, rtol=1e-12)
-    assert np.isfinite(hits.distance).sum() >= 8 * 8
+    assert np.isfinite(hits.distance).sum() > 50
 
 
 def test_rays_around_a_sphere():
