@@ -130,6 +130,7 @@ def test_rollouts_are_shown_when_asked_for(finished, tmp_path):
     assert not (tmp_path / "plain" / "rollouts.png").exists()
     with pytest.raises(UserError, match=r"No finished cell of metaworld/reach has its last checkpoint in"):
         report([folder.path], tmp_path / "other", as_html=False, rollouts_of=["metaworld/reach"])
+    assert not (tmp_path / "other").exists()
     with pytest.raises(UserError, match="has its last checkpoint"):  # rows alone make no pictures
         report([tmp_path / "plain"], tmp_path / "other", as_html=False, rollouts_of=[GOOD.task])
 

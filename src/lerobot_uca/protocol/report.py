@@ -30,13 +30,14 @@ def report(runs: Sequence[Path], output: Path, *, as_html: bool, rollouts_of: Se
         rollouts_of: tasks of which an episode of each policy is shown; for that it is run again.
 
     Raises:
-        UserError: if there are no results, or the folder cannot be written.
+        UserError: if there are no results, or no checkpoint for rollouts, or the folder cannot be written.
     """
     results, corrupt = Results.read(runs)
     for line in corrupt:
         print(f"warning: {line}", file=sys.stderr)
     if not results.rows:
         raise UserError(f"There are no results yet in {', '.join(map(str, runs))}.")
+    strips = rollouts.strips_of(runs, results, rollouts_of) if rollouts_of else []
     tables = [make(results) for make in TABLES]
     markdown = "\n".join(table.markdown() for table in tables)
     try:
@@ -47,8 +48,8 @@ def report(runs: Sequence[Path], output: Path, *, as_html: bool, rollouts_of: Se
             (output / f"{table.name}.csv").write_text(table.csv(), encoding="utf-8")
             (output / f"{table.name}.tex").write_text(table.latex(), encoding="utf-8")
         figures = draw(results, output)
-        if rollouts_of:
-            figures.append(rollouts.draw(runs, results, rollouts_of, output))
+        if strips:
+            figures.append(rollouts.draw(strips, output))
         if as_html:
             page = _page(results, [table.html() for table in tables], figures)
             (output / "report.html").write_text(page, encoding="utf-8")

@@ -35,22 +35,21 @@ class Strip(NamedTuple):
     """By the actions executed before."""
 
 
-def draw(runs: Sequence[Path], results: Results, tasks: Sequence[str], folder: Path) -> Path:
-    """Write rollouts.png and rollouts.svg, the first training seed of each policy on each task; the SVG file.
+def strips_of(runs: Sequence[Path], results: Results, tasks: Sequence[str]) -> list[Strip]:
+    """The strips of these tasks, of each policy's first training seed.
 
     Raises:
-        UserError: if no cell of these tasks has its last checkpoint, as in a report's folder.
+        UserError: if no cell of them has its last checkpoint, as in a report's folder.
     """
     cells = [cell for cell in results.first_cells() if cell.task in tasks]
     load_lerobot()
-    strips = [
-        strip for cell in sorted(cells, key=lambda cell: tasks.index(cell.task)) for strip in _film(runs, results, cell)
-    ]
+    ordered = sorted(cells, key=lambda cell: tasks.index(cell.task))
+    strips = [strip for cell in ordered for strip in _film(runs, results, cell)]
     if not strips:
         raise UserError(
             f"No finished cell of {', '.join(tasks)} has its last checkpoint in {', '.join(map(str, runs))}."
         )
-    return write(_figure(strips), folder / "rollouts")
+    return strips
 
 
 def _film(runs: Sequence[Path], results: Results, cell: Cell) -> Iterator[Strip]:
@@ -84,7 +83,8 @@ def film(checkpoint: Path, cell: Cell, row: Row) -> Strip:
     return Strip(cell, episode.seed, episode.success, pictures)
 
 
-def _figure(strips: Sequence[Strip]) -> Any:
+def draw(strips: Sequence[Strip], folder: Path) -> Path:
+    """Write rollouts.png and rollouts.svg, a row a strip; the SVG file."""
     size = (1.6 * N_PICTURES, 1.75 * len(strips))
     figure, axes = pyplot().subplots(len(strips), N_PICTURES, figsize=size, squeeze=False, layout="constrained")
     for axis in axes.flat:
@@ -95,4 +95,4 @@ def _figure(strips: Sequence[Strip]) -> Any:
         for axis, (step, picture) in zip(row, strip.pictures.items(), strict=False):
             axis.imshow(picture)
             axis.set_title(f"step {step}", fontsize=7)
-    return figure
+    return write(figure, folder / "rollouts")
