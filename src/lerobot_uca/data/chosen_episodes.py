@@ -53,9 +53,11 @@ def check_finite(dataset: Any, masks: Masks) -> None:
         for episode, stats in _episode_statistics(dataset, masks).items():
             for key, of_key in stats.items():
                 if not all(np.isfinite(each).all() for each in of_key.values()):
+                    frame = _first_bad_frame(dataset, key, episode)
+                    place = "or its statistics" if frame is None else f"frame {frame}"
                     raise UserError(
-                        f"'{key}' must be finite, got NaN or infinite values in episode {episode}, frame "
-                        f"{_first_bad_frame(dataset, key, episode)}. {_without([episode], dataset)}"
+                        f"'{key}' must be finite, got NaN or infinite values in episode {episode}, {place}. "
+                        + _without([episode], dataset)
                     )
         return
     for key, mask in masks.items():
@@ -77,11 +79,11 @@ def check_finite(dataset: Any, masks: Masks) -> None:
             )
 
 
-def _first_bad_frame(dataset: Any, key: str, episode: int) -> int:
+def _first_bad_frame(dataset: Any, key: str, episode: int) -> int | None:
     for row in dataset.hf_dataset.select_columns([key, "episode_index", "frame_index"]):
         if int(row["episode_index"]) == episode and not torch.isfinite(torch.as_tensor(row[key])).all():
             return int(row["frame_index"])
-    raise AssertionError(f"The statistics of episode {episode} are not those of its rows.")
+    return None
 
 
 def _bad(values: Tensor, valid: Tensor) -> Tensor:
