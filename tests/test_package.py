@@ -281,6 +281,24 @@ assert hasattr(factory.LeRobotDataset, "__getitems__")
     assert result.stderr.count("is missing") == 1
 
 
+def test_without_the_check_of_checkpoints_the_import_fails_and_leaves_the_rest():
+    before = """
+import lerobot_uca.lerobot_patches as patches
+def make_registered_steps_only():
+    raise AttributeError("module 'lerobot' has no attribute 'gone'")
+patches.make_registered_steps_only = make_registered_steps_only
+try:
+    import lerobot_policy_uca_flow
+except AttributeError:
+    print("refused")
+from lerobot.datasets import factory
+assert hasattr(factory.LeRobotDataset, "__getitems__")
+raise SystemExit
+"""
+    result = load(before, "")
+    assert (result.returncode, result.stdout) == (0, "refused\n"), result.stderr
+
+
 @pytest.mark.parametrize("engine", ["openvino", "onnxruntime"])
 def test_without_an_engine_every_policy_registers_and_pytorch_computes(engine):
     after = f"""

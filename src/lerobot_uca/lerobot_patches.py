@@ -83,7 +83,14 @@ logger = logging.getLogger(__name__)
 
 def install() -> None:
     """Apply all patches, each for itself. A second call changes nothing."""
-    patches = [report_user_errors, shorten_decoder_warning, make_registered_steps_only]
+    try:
+        make_registered_steps_only()  # no line in a log: without it a checkpoint could run code
+    finally:
+        _install_conveniences()
+
+
+def _install_conveniences() -> None:
+    patches = [report_user_errors, shorten_decoder_warning]
     if Path(sys.argv[0]).stem.startswith("lerobot"):  # one of LeRobot's commands, not somebody's own program
         patches.append(end_by_signals)
     if is_supported():

@@ -34,7 +34,7 @@ from lerobot_uca.hub import push_dataset
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import MIN_SHARE
 from lerobot_uca.point_clouds.geometry import sample_farthest
-from lerobot_uca.point_clouds.recipe import RECIPE_INFO, make_crop
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, optional_crop
 from lerobot_uca.processes import worker_pool
 
 logger = logging.getLogger(__name__)
@@ -128,14 +128,11 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
 
 def make_source(config: ConvertConfig) -> Source:
     """The source as configured, with its crop and, for depth, its recipe."""
-    if (config.crop_low is None) != (config.crop_high is None):
-        raise UserError("Give both crop_low and crop_high, or neither.")
-    corners = None if config.crop_low is None or config.crop_high is None else (config.crop_low, config.crop_high)
     try:
-        crop = make_crop(*corners) if corners else None
+        crop = optional_crop(config.crop_low, config.crop_high)
         source = find_source(config.source, crop, config.task, colour=config.colour)
         if isinstance(source, LeRobotSource) and source.has_depth:
-            source.make_clouds(corners, config.n_points, config.calibration)
+            source.make_clouds((crop.low, crop.high) if crop else None, config.n_points, config.calibration)
     except CalibrationError as error:
         raise UserError(str(error)) from error
     return source

@@ -130,7 +130,7 @@ class _Weights:
         self._owners = [module._parameters for module in network.modules() if module._parameters]
         self._seen = self._look()
         # While a storage is kept, no other one has its address.
-        self._kept = [weight.detach() for owner in self._owners for weight in owner.values() if weight is not None]
+        self._kept = [weight.detach() for weight in network.parameters()]
 
     def have_changed(self) -> bool:
         """Whether any weight is not what it was."""

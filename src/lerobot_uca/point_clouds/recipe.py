@@ -170,6 +170,19 @@ def make_crop(low: Iterable[float], high: Iterable[float]) -> Crop:
     return Crop((a[0], a[1], a[2]), (b[0], b[1], b[2]))
 
 
+def optional_crop(low: Iterable[float] | None, high: Iterable[float] | None) -> Crop | None:
+    """A crop from two options, or None if neither is given.
+
+    Raises:
+        CalibrationError: for one without the other, and as `make_crop`.
+    """
+    if low is None and high is None:
+        return None
+    if low is None or high is None:
+        raise CalibrationError("Give both crop_low and crop_high, or neither.")
+    return make_crop(low, high)
+
+
 def _corners(crop: Crop) -> str:
     return f"{list(crop.low)} to {list(crop.high)}"
 

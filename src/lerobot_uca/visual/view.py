@@ -25,7 +25,7 @@ from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.geometry import Crop
-from lerobot_uca.point_clouds.recipe import make_crop
+from lerobot_uca.point_clouds.recipe import optional_crop
 from lerobot_uca.visual.crop_page import CropPage, colours_of
 from lerobot_uca.visual.live_camera import live_clouds
 
@@ -115,13 +115,12 @@ def crop_of(config: ViewConfig, points: NDArray[np.float32]) -> Crop:
     Raises:
         UserError: for a crop that cannot be, and without one for a cloud without points.
     """
-    if (config.crop_low is None) != (config.crop_high is None):
-        raise UserError("Give both crop_low and crop_high, or neither.")
-    if config.crop_low is not None and config.crop_high is not None:
-        try:
-            return make_crop(config.crop_low, config.crop_high)
-        except CalibrationError as error:
-            raise UserError(str(error)) from error
+    try:
+        crop = optional_crop(config.crop_low, config.crop_high)
+    except CalibrationError as error:
+        raise UserError(str(error)) from error
+    if crop is not None:
+        return crop
     if not len(points):
         raise UserError("The first frame has no point: give crop_low and crop_high, or look at another episode.")
     low, high = (np.round(np.percentile(points[:, :3], share, axis=0), 2).tolist() for share in (1, 99))
