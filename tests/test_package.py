@@ -18,6 +18,7 @@ DISTRIBUTION = "lerobot_policy_uca_flow"
 # The modules or folders that each may import from this package. Imports run one way; unlisted ones are leaves.
 ALLOWED = {
     "inference": {"errors"},
+    "point_clouds": {"whole_file"},
     "objectives": {"meanflow", "networks"},
     "bounds": {"errors"},
     "hub": {"errors"},
@@ -27,11 +28,11 @@ ALLOWED = {
         *("errors", "features", "hub", "registry"),
     },
     "envs": {"bounds", "point_clouds", "errors", "features", "registry", "processes"},
-    "data": {"bounds", "envs", "point_clouds", "errors", "features", "hub", "processes"},
+    "data": {"bounds", "envs", "point_clouds", "errors", "features", "hub", "processes", "whole_file"},
     "robots": {"point_clouds", "errors", "features", "registry", "processes"},
-    "visual": {"bounds", "policies", "data", "envs", "robots", "point_clouds", "errors", "features"},
-    "deploy": {"policies", "inference", "errors", "features"},
-    "protocol": {"policies", "data", "envs", "errors", "features", "processes"},
+    "visual": {"bounds", "policies", "data", "envs", "robots", "point_clouds", "errors", "features", "whole_file"},
+    "deploy": {"policies", "inference", "errors", "features", "whole_file"},
+    "protocol": {"policies", "data", "envs", "errors", "features", "processes", "whole_file"},
     "checkpoints": {"data", "errors"},
     "lerobot_patches": {
         "lerobot_version",

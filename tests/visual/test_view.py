@@ -14,10 +14,11 @@ from tests.robots.conftest import wait_until
 
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE
 from lerobot_uca.visual import view as command
 from lerobot_uca.visual.crop_page import INSIDE, OUTSIDE, colours_of, write_crop
-from lerobot_uca.visual.view import ViewConfig, clouds_of, view
+from lerobot_uca.visual.view import ViewConfig, clouds_of, record, view
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +161,16 @@ def test_what_cannot_be_shown_is_one_line(depth_dataset, tmp_path):
         list(view(ViewConfig(source=depth_dataset.root, rrd=tmp_path / "none" / "a.rrd")))
     with pytest.raises(UserError, match="The first frame has no point"):
         command.crop_of(ViewConfig(source=depth_dataset.root), np.empty((0, 3), np.float32))
+
+
+def test_a_recording_that_ends_early_is_not_left_behind(tmp_path):
+    def clouds():
+        yield np.zeros((4, 6), np.float32)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record(tmp_path / "a.rrd", clouds(), Crop((-1, -1, -1), (1, 1, 1)))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_a_crop_the_box_of_the_points_is_shown():

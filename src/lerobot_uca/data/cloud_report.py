@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.whole_file import whole_file
 
 
 class EpisodeReport(NamedTuple):
@@ -49,12 +50,8 @@ def write_report(folder: Path, episodes: Sequence[EpisodeReport], least: int) ->
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in (("report.txt", text.encode()), ("report.png", picture.getvalue())):
-            unfinished = folder / f".{name}.unfinished"
-            try:
+            with whole_file(folder / name) as unfinished:
                 unfinished.write_bytes(content)
-                unfinished.replace(folder / name)
-            finally:
-                unfinished.unlink(missing_ok=True)
     except OSError as error:
         raise UserError(f"Cannot write the report: {error}") from error
 

@@ -5,7 +5,6 @@ Example:
 """
 
 import argparse
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference.traced import to_onnx
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
+from lerobot_uca.whole_file import whole_file
 
 # These steps do the same for all observations, so that a trace of them holds. A file takes clouds: the step that
 # makes them from depth images has nothing to do, nor has the one that changes training's.
@@ -115,10 +115,8 @@ def export(checkpoint: str, output: Path, *, overwrite: bool = False) -> dict[st
     _check_same_actions(model, raw_policy)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=output.parent) as folder:
-            unfinished = Path(folder, output.name)
+        with whole_file(output) as unfinished:
             unfinished.write_bytes(model)
-            unfinished.replace(output)
     except OSError as error:
         raise UserError(f"Cannot write '{output}': {error}") from error
     return shapes

@@ -22,6 +22,7 @@ import yaml
 
 from lerobot_uca.point_clouds.depth import FAR, MILLIMETRE, NEAR, DepthView
 from lerobot_uca.point_clouds.geometry import Array, Camera, as_pose
+from lerobot_uca.whole_file import whole_file
 
 FRAMES = ("base", "tool")
 MAX_DISTANCE = 5.0
@@ -120,9 +121,8 @@ class Calibration:
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / f"{self.serial}.yaml"
         text = yaml.safe_dump(self.as_dict(), sort_keys=False, default_flow_style=None, width=110)
-        unfinished = file.with_suffix(".unfinished")
-        unfinished.write_text(HEADER + text, encoding="utf-8")
-        unfinished.replace(file)
+        with whole_file(file) as unfinished:
+            unfinished.write_text(HEADER + text, encoding="utf-8")
         return file
 
 

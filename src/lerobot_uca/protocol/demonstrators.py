@@ -21,6 +21,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.processes import worker_pool
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.launchers import n_cores
+from lerobot_uca.whole_file import whole_file
 
 
 class Trial(NamedTuple):
@@ -113,11 +114,9 @@ def _of_task(task: str, expert: str | None, smoothing: float) -> tuple[Any, Iter
 
 
 def _write(path: Path, rows: Sequence[Demonstrator]) -> None:
-    unfinished = path.with_name(f".{path.name}.unfinished")
     try:
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
+        with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerows([Demonstrator._fields, *rows])
-        unfinished.replace(path)
     except OSError as error:
         raise UserError(f"--output '{path}' cannot be written: {error}") from error

@@ -24,6 +24,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.rows import CorruptRow, Row, read_rows
 from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.whole_file import whole_file
 
 
 class CellFolder:
@@ -133,9 +134,8 @@ class RunFolder:
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
     """Write a JSON file, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    unfinished.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
-    unfinished.replace(path)
+    with whole_file(path) as unfinished:
+        unfinished.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 
 
 def _read_json(path: Path) -> Any:

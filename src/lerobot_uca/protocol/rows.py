@@ -1,12 +1,12 @@
 """Rows of results: one an episode, in CSV files that are written whole or not at all."""
 
 import csv
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple, Self
 
 from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.whole_file import whole_file
 
 
 class Row(NamedTuple):
@@ -63,14 +63,10 @@ class Row(NamedTuple):
 
 def write_rows(path: Path, rows: Iterable[Row]) -> None:
     """Write a CSV file, whole or not at all, also if the process is killed or the disk is full."""
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    with unfinished.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(Row._fields)
         writer.writerows(row.as_text() for row in rows)
-        file.flush()
-        os.fsync(file.fileno())
-    unfinished.replace(path)
 
 
 class CorruptRow(NamedTuple):

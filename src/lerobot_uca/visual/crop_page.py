@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.whole_file import whole_file
 
 INSIDE, OUTSIDE = (33, 102, 172), (200, 200, 200)
 POINTS_ACROSS = 250
@@ -106,9 +107,8 @@ def write_crop(file: Path, crop: Crop) -> None:
         raise UserError(f"'{file}' must be a training configuration, got {type(settings).__name__}.")
     depth = settings.setdefault("policy", {}).setdefault("depth", {})
     depth["crop_low"], depth["crop_high"] = list(crop.low), list(crop.high)
-    unfinished = file.with_name(f".{file.name}.unfinished")
     try:
-        unfinished.write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
-        unfinished.replace(file)
+        with whole_file(file) as unfinished:
+            unfinished.write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
     except OSError as error:
         raise UserError(f"Cannot write '{file}': {error}") from error

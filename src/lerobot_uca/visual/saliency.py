@@ -24,6 +24,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
+from lerobot_uca.whole_file import whole_file
 
 N_MOMENTS = 4
 
@@ -134,7 +135,8 @@ def draw(moments: Moments, path: Path) -> None:
         every.append(axes)
     figure.suptitle("Points that decide the predicted actions (grey: hardly, red: most of all at this step)")
     figure.colorbar(shown, ax=every, shrink=0.7, label="influence, the step's greatest is 1")
-    figure.savefig(path, dpi=100)
+    with whole_file(path) as unfinished:
+        figure.savefig(unfinished, dpi=100)
     plt.close(figure)
 
 
@@ -145,16 +147,17 @@ def record(moments: Moments, path: Path) -> None:
     except ImportError as error:
         raise UserError("--rerun needs Rerun: pip install 'lerobot_policy_uca_flow[rerun]'.") from error
     recording = rerun.RecordingStream("lerobot_uca_saliency")
-    recording.save(path)
-    for index, step in enumerate(moments.steps):
-        recording.set_time("step", sequence=step)
-        value = moments.saliency[index][:, None]
-        colours = (255 * np.hstack([value, value**2, 0.4 * (1 - value)])).astype(np.uint8)
-        recording.log("cloud", rerun.Points3D(moments.points[index], colors=colours))
-        recording.log(OBS_STATE.replace(".", "/"), rerun.Scalars(moments.states[index]))
-        for ahead, action in enumerate(moments.actions[index]):
-            recording.log(f"{ACTION}/{ahead}_steps_ahead", rerun.Scalars(action))
-    recording.disconnect()
+    with whole_file(path) as unfinished:
+        recording.save(unfinished)
+        for index, step in enumerate(moments.steps):
+            recording.set_time("step", sequence=step)
+            value = moments.saliency[index][:, None]
+            colours = (255 * np.hstack([value, value**2, 0.4 * (1 - value)])).astype(np.uint8)
+            recording.log("cloud", rerun.Points3D(moments.points[index], colors=colours))
+            recording.log(OBS_STATE.replace(".", "/"), rerun.Scalars(moments.states[index]))
+            for ahead, action in enumerate(moments.actions[index]):
+                recording.log(f"{ACTION}/{ahead}_steps_ahead", rerun.Scalars(action))
+        recording.disconnect()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -28,6 +28,7 @@ from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import optional_crop
 from lerobot_uca.visual.crop_page import CropPage, colours_of
 from lerobot_uca.visual.live_camera import live_clouds
+from lerobot_uca.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -139,7 +140,8 @@ def draw(file: Path, points: NDArray[np.float32], crop: Crop) -> None:
         axes.scatter(points[:, a], points[:, b], c=colours, s=2)
         axes.set(xlabel=f"{'xyz'[a]} [m]", ylabel=f"{'xyz'[b]} [m]", aspect="equal")
     try:
-        figure.savefig(file, dpi=100)
+        with whole_file(file) as unfinished:
+            figure.savefig(unfinished, dpi=100)
     except (OSError, ValueError) as error:
         raise UserError(f"Cannot write '{file}': {error}") from error
 
@@ -152,13 +154,14 @@ def record(file: Path, clouds: Iterator[NDArray[np.float32]], crop: Crop) -> Non
         raise UserError("Recordings need rerun-sdk: pip install 'lerobot_policy_uca_flow[view]'.") from error
     recording = rerun.RecordingStream("lerobot_uca")
     try:
-        recording.save(str(file))
+        with whole_file(file) as unfinished:
+            recording.save(str(unfinished))
+            for index, points in enumerate(clouds):
+                recording.set_time("frame", sequence=index)
+                recording.log("cloud", rerun.Points3D(points[:, :3], colors=colours_of(points, crop), radii=0.003))
+            recording.disconnect()
     except (OSError, RuntimeError) as error:
         raise UserError(f"Cannot write '{file}': {error}") from error
-    for index, points in enumerate(clouds):
-        recording.set_time("frame", sequence=index)
-        recording.log("cloud", rerun.Points3D(points[:, :3], colors=colours_of(points, crop), radii=0.003))
-    recording.flush()
 
 
 def pages_of(config: ViewConfig, clouds: Iterator[NDArray[np.float32]]) -> Iterator[CropPage]:

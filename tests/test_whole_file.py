@@ -1,0 +1,67 @@
+"""A file is written whole or not at all."""
+
+import multiprocessing
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from lerobot_uca.whole_file import whole_file
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "report.txt"
+    path.write_text("old")
+    return path
+
+
+def killed_while_writing(file: Path) -> None:
+    with whole_file(file) as unfinished:
+        unfinished.write_text("half of the n")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_what_was_there_stays_until_the_new_file_is_complete(file):
+    with whole_file(file) as unfinished:
+        unfinished.write_text("new")
+        assert (file.read_text(), unfinished.suffix) == ("old", ".txt")
+    assert file.read_text() == "new"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def fail_while_writing(file: Path) -> None:
+    with whole_file(file) as unfinished:
+        unfinished.write_text("half of the n")
+        raise ZeroDivisionError
+
+
+def test_a_failure_leaves_what_was_there_and_nothing_else(file):
+    with pytest.raises(ZeroDivisionError):
+        fail_while_writing(file)
+    assert file.read_text() == "old"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_kill_leaves_what_was_there_and_the_next_writer_tidies_up(file):
+    process = multiprocessing.get_context("spawn").Process(target=killed_while_writing, args=(file,))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    assert file.read_text() == "old"
+    with whole_file(file) as unfinished:
+        unfinished.write_text("new")
+    assert file.read_text() == "new"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_block_that_writes_nothing_is_an_error(file):
+    with pytest.raises(FileNotFoundError), whole_file(file):
+        pass
+    assert file.read_text() == "old"
+
+
+def test_a_folder_that_is_not_there_is_an_error_of_the_system(tmp_path):
+    with pytest.raises(OSError, match="no_folder"), whole_file(tmp_path / "no_folder" / "file") as unfinished:
+        unfinished.write_text("new")
