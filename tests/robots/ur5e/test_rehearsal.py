@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 import threading
+import time
 from contextlib import closing
 
 import numpy as np
@@ -19,9 +20,10 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import read_calibrations
 from lerobot_uca.robots.ur5e.channel import ArmStoppedError
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
+from lerobot_uca.robots.ur5e.sim.command import SimulatedWorld
 from lerobot_uca.robots.ur5e.sim.config_scripted_teleoperator import ScriptedTeleoperatorConfig
 from lerobot_uca.robots.ur5e.sim.config_simulated_camera import SimulatedCameraConfig
-from lerobot_uca.robots.ur5e.sim.scene_service import SceneClient, simulated_camera
+from lerobot_uca.robots.ur5e.sim.scene_service import FAULTS, SceneClient, simulated_camera
 from lerobot_uca.robots.ur5e.ur5e_follower import UR5eFollower
 from lerobot_uca.visual.view import ViewConfig, view
 
@@ -78,7 +80,7 @@ def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path
     robot = robot_config(address, tmp_path, top=SimulatedCameraConfig(ip=address))
     record(RecordConfig(robot=robot, dataset=dataset_config, teleop=teleop, play_sounds=False))
     wait_until(lambda: scene.ask(request="state")["success"])
-    end = things(scene)
+    end, end_yaw = things(scene), scene.ask(request="state")["cube"][3]
 
     (folder,) = tmp_path.glob("data*")
     dataset = LeRobotDataset("test/ur5e", root=folder, episodes=[n_episodes - 1])
@@ -106,6 +108,7 @@ def test_an_episode_is_recorded_and_its_replay_goes_the_same_way(world, tmp_path
     )
     wait_until(lambda: scene.ask(request="state")["success"])
     np.testing.assert_allclose(things(scene), end, atol=0.01)
+    assert abs(scene.ask(request="state")["cube"][3] - end_yaw) < 0.1
     away = distance_to_path(np.array(measured[1:])[:, :6], states[:, :6])
     assert away.max() < 0.01
     scene.close()
@@ -168,6 +171,14 @@ def test_the_calibration_of_another_camera_is_refused(world, tmp_path, monkeypat
     assert not robot.is_connected
 
 
+def turn(robot, start, n_steps):
+    """Observe and act, as LeRobot's loop does, while the arm turns away from `start`."""
+    for step in range(n_steps):
+        robot.send_action({**start, "shoulder_pan.pos": start["shoulder_pan.pos"] + 0.005 * step})
+        robot.get_observation()
+        time.sleep(1 / FPS)
+
+
 @pytest.mark.parametrize("fault", ["dead_camera", "stale_frames"])
 def test_a_camera_that_fails_stops_the_arm_in_one_line(world, tmp_path, fault):
     address, _ = world
@@ -179,18 +190,15 @@ def test_a_camera_that_fails_stops_the_arm_in_one_line(world, tmp_path, fault):
         assert observation["top_depth"].shape == (120, 160, 1)
         assert observation["top_depth"].dtype == np.uint16
         assert observation["top"].shape == (120, 160, 3)
+        joints = {key: value for key, value in observation.items() if key in robot.action_features}
         scene.ask(request="fault", fault=fault)
-
-        def fails():
-            try:
-                robot.get_observation()
-            except ArmStoppedError as error:
-                return str(error)
-            return ""
-
-        wait_until(fails)
-        with pytest.raises(ArmStoppedError):
-            robot.send_action(dict.fromkeys(robot.action_features, 0.0))
+        with pytest.raises(ArmStoppedError, match=r"'top' gives no pictures .*; the arm was stopped"):
+            turn(robot, joints, n_steps=300)
+        with pytest.raises(ArmStoppedError, match="the arm was stopped"):
+            robot.send_action(joints)
+        stood = scene.ask(request="state")["q"]
+        time.sleep(0.2)
+        np.testing.assert_allclose(scene.ask(request="state")["q"], stood, atol=1e-4)
     scene.ask(request="fault", fault="none")
     scene.close()
 
@@ -235,3 +243,56 @@ def test_an_invalid_request_is_answered(world):
     with pytest.raises(ConnectionError, match=r"one of .*dead_camera"):
         scene.ask(request="fault", fault="earthquake")
     scene.close()
+
+
+ENDS = {
+    "protective_stop": "Protective stop",
+    "safeguard_stop": "Safeguard stop",
+    "emergency_stop": "Emergency stop",
+    "silent_rtde": "No data from",
+    "gone": "connection to .* is lost",
+    "killed_client": r"has ended \(SIGKILL\)",
+    "latency": "",
+    "dropped_packets": "",
+}
+
+
+def test_every_fault_is_tried_here_or_with_the_camera():
+    assert set(FAULTS) == {*ENDS, "dead_camera", "stale_frames", "none"}
+
+
+@pytest.mark.parametrize("fault", ENDS)
+def test_an_injected_fault_ends_as_documented(tmp_path, fault):
+    """Or, of a bad network, is ridden out."""
+    address = free_address()
+    with SimulatedWorld(address) as world, UR5eFollower(robot_config(address, tmp_path)) as robot:
+        start = {key: robot.get_observation()[key] for key in robot.action_features}
+        turn(robot, start, n_steps=10)
+        world.service.fault(fault)
+        if ENDS[fault]:
+            with pytest.raises(ArmStoppedError, match=ENDS[fault]):
+                turn(robot, start, n_steps=40)
+        else:
+            turn(robot, start, n_steps=40)
+            target = start["shoulder_pan.pos"] + 0.005 * 39
+            wait_until(lambda: abs(robot.get_observation()["shoulder_pan.pos"] - target) < 0.01)
+        robot.disconnect()
+        wait_until(lambda: np.abs(world.scene.arm.qd).max() < 1e-2)
+
+
+def test_the_command_injects_a_fault_once_the_arm_is_steered(tmp_path):
+    address = free_address()
+    code = "from lerobot_uca.commands import ur5e_sim; ur5e_sim()"
+    options = ["--ip", address, "--fault=killed_client", "--after=0.5"]
+    process = subprocess.Popen([sys.executable, "-c", code, *options], stderr=subprocess.PIPE, text=True)
+    try:
+        assert any("serves" in line for line in process.stderr)
+        time.sleep(1.0)  # nobody steers it yet
+        with (
+            UR5eFollower(robot_config(address, tmp_path)) as robot,
+            pytest.raises(ArmStoppedError, match=r"has ended \(SIGKILL\)"),
+        ):
+            wait_until(lambda: robot.get_observation() is None)
+    finally:
+        process.terminate()
+        process.communicate()

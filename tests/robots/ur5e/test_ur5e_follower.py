@@ -22,6 +22,7 @@ from lerobot_uca.robots.ur5e.channel import ArmStoppedError
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
 from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_to_vector
 from lerobot_uca.robots.ur5e.sim.controller import Controller
+from lerobot_uca.robots.ur5e.sim.gripper import CLOSED_COUNT, OPEN_COUNT
 from lerobot_uca.robots.ur5e.sim.robot import Command, IdealArm, Runtime
 from lerobot_uca.robots.ur5e.ur5e_follower import GRIPPER_KEY, JOINT_KEYS, TCP_KEYS, ClippingReport, UR5eFollower
 
@@ -144,6 +145,44 @@ def test_the_first_action_is_eased_to_and_far_ones_are_clipped_and_said(controll
     assert "1 targets were clipped, by up to" in caplog.text
 
 
+def test_the_way_to_the_first_action_is_as_slow_as_the_arm_may_be(controller, tmp_path):
+    with make_robot(controller, tmp_path, max_velocity=0.05, gripper="none") as robot:
+        setpoints = keep_setpoints(controller)
+        target = HOME + np.array([0.1, -0.05, 0, 0, 0, 0])
+        robot.send_action(dict(zip(JOINT_KEYS, target, strict=True)))
+        assert np.abs(controller.robot.arm.q - target).max() < 4e-3
+    assert fastest(setpoints, robot) < 0.05 * 1.05
+    way = (np.array(setpoints) - HOME)[:, :2]
+    np.testing.assert_allclose(way[:, 1], -way[:, 0] / 2, atol=1e-3)  # straight
+
+
+EASING = """
+import sys
+from pathlib import Path
+from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
+from lerobot_uca.robots.ur5e.ur5e_follower import JOINT_KEYS, UR5eFollower
+config = UR5eFollowerConfig(ip=sys.argv[1], gripper="none", stop_after=0.5, calibration_dir=Path(sys.argv[2]))
+with UR5eFollower(config) as robot:
+    start = robot.get_observation()
+    robot.send_action({**start, "shoulder_pan.pos": 3.0})  # 12 s away
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL, signal.SIGINT], ids=["suspended", "killed", "Ctrl-C"])
+def test_a_driver_that_stops_on_the_way_to_the_first_action_stops_the_arm(controller, tmp_path, how):
+    driver = subprocess.Popen(
+        [sys.executable, "-c", EASING, controller.address, str(tmp_path)], stderr=subprocess.DEVNULL
+    )
+    wait_until(lambda: speed(controller) > 0.1)
+    driver.send_signal(how)
+    wait_until(lambda: stands_still(controller))
+    time.sleep(0.2)
+    assert stands_still(controller)
+    assert controller.robot.arm.q[0] < 2.0
+    driver.kill()
+    driver.wait(10)
+
+
 class HeldArm(IdealArm):
     """An arm that leans on something."""
 
@@ -206,13 +245,16 @@ def test_without_actions_the_arm_holds_then_stops_and_eases_in_again(controller,
 STOPS = {
     "protective stop": lambda controller: controller.robot.protective_stop("a collision"),
     "emergency stop": lambda controller: controller.robot.emergency_stop(),
+    "safeguard stop": lambda controller: controller.robot.safeguard_stop(),
     "program": lambda controller: controller.robot.stop_program(),
     "no data|connection": lambda controller: setattr(controller.network, "is_silent", True),
     "connection|ended": lambda controller: controller.vanish(),
 }
 
 
-@pytest.mark.parametrize(("line", "fault"), STOPS.items(), ids=["protective", "emergency", "program", "silent", "gone"])
+@pytest.mark.parametrize(
+    ("line", "fault"), STOPS.items(), ids=["protective", "emergency", "safeguard", "program", "silent", "gone"]
+)
 def test_a_fault_ends_standing_still_and_in_one_line(controller, robot, line, fault):
     errors = keep_moving(robot)
     wait_until(lambda: speed(controller) > 0.1)
@@ -226,6 +268,55 @@ def test_a_fault_ends_standing_still_and_in_one_line(controller, robot, line, fa
     assert any(each in str(error).lower() for each in line.split("|")), error
     with pytest.raises(ArmStoppedError):
         robot.get_observation()
+
+
+def test_a_paused_program_is_ended_and_does_not_go_on_by_itself(controller, robot, tmp_path):
+    errors = keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    with controller.robot.lock:
+        controller.robot.safeguard_stop()
+        assert controller.robot.runtime == Runtime.PAUSED
+    wait_until(lambda: errors)
+    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
+    stood = controller.robot.arm.q
+    with controller.robot.lock:
+        controller.robot.leave_guarded_area()
+    with make_robot(controller, tmp_path):
+        np.testing.assert_array_equal(controller.robot.arm.q, stood)
+
+
+def test_a_program_that_somebody_paused_is_refused(controller, tmp_path):
+    controller.robot.runtime = Runtime.PAUSED
+    with pytest.raises(UserError, match=r"already \(PAUSED .*another client or the pendant holds the arm"):
+        make_robot(controller, tmp_path).connect()
+
+
+def test_late_data_brake_the_setpoint_which_then_goes_on(controller, robot):
+    keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    controller.network.is_silent = True
+    wait_until(lambda: has_braked(robot))
+    assert robot._arm.state().is_servoing
+    controller.network.is_silent = False
+    wait_until(lambda: speed(controller) > 0.1)
+
+
+def has_braked(robot) -> bool:
+    before = robot._arm.state().setpoint
+    time.sleep(0.05)
+    return robot._arm.state().setpoint == before
+
+
+def test_a_client_that_hangs_is_noticed_and_ended(controller, robot):
+    keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    client = robot._arm._process
+    os.kill(client.pid, signal.SIGSTOP)
+    with pytest.raises(ArmStoppedError, match=r"has not been heard for 1\.\d s and was ended"):
+        wait_until(lambda: robot.get_observation() is None)
+    assert client.wait(5) == -signal.SIGKILL
+    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
+    wait_until(lambda: stands_still(controller))
 
 
 @pytest.mark.parametrize(("fault", "size"), [("latency", 0.05), ("drop", 0.1)])
@@ -310,11 +401,24 @@ BAD_ACTIONS = {
 
 @pytest.mark.parametrize(("change", "message"), BAD_ACTIONS.values(), ids=BAD_ACTIONS)
 def test_bad_actions_are_refused_and_move_nothing(controller, robot, change, message):
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(ArmStoppedError, match=rf"{message}.* The arm was stopped\."):
         robot.send_action({**action_at(HOME), **change})
+    with pytest.raises(ArmStoppedError, match=message):  # whatever comes after, as LeRobot's way back to its start
+        robot.send_action(action_at(HOME + 0.1))
+    np.testing.assert_allclose(controller.robot.arm.q, HOME)
+
+
+def test_a_missing_name_is_said(robot):
     with pytest.raises(UserError, match=r"missing: elbow\.pos"):
         robot.send_action({key: 0.0 for key in robot.action_features if key != "elbow.pos"})
-    np.testing.assert_allclose(controller.robot.arm.q, HOME)
+
+
+def test_a_bad_action_on_the_way_stops_the_arm(controller, robot):
+    last = stream(robot, 0.3, seconds=1.0)
+    with pytest.raises(ArmStoppedError, match="finite numbers"):
+        robot.send_action({**action_at(last), JOINT_KEYS[3]: math.nan})
+    wait_until(lambda: stands_still(controller))
+    assert controller.robot.runtime == Runtime.STOPPED
 
 
 BAD_SETTINGS = {
@@ -347,8 +451,10 @@ def test_an_address_that_never_answers_takes_the_seconds_that_are_said(tmp_path)
     address = free_address()
     with socket.create_server((address, 29999), backlog=0), socket.create_connection((address, 29999)):
         robot = UR5eFollower(UR5eFollowerConfig(ip=address, calibration_dir=tmp_path))
+        began = time.monotonic()
         with pytest.raises(UserError, match=r"\(?3 s"):
             robot.connect()
+        assert 2.9 < time.monotonic() - began < 6  # a busy machine is late
 
 
 def test_something_else_on_the_port_is_said(tmp_path):
@@ -383,6 +489,57 @@ def test_an_arm_without_a_gripper_is_said(tmp_path):
             assert list(robot.get_observation()) == list(JOINT_KEYS)
 
 
+def test_a_gripper_that_is_lost_stops_the_arm(controller, robot):
+    errors = keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    controller.gripper.get = lambda name: "?"
+    with pytest.raises(ArmStoppedError, match=r"gripper no longer answers \(The gripper has no value for POS"):
+        wait_until(lambda: robot.get_observation() is None)
+    wait_until(lambda: stands_still(controller))
+    wait_until(lambda: errors)
+
+
+def test_a_gripper_with_a_fault_is_refused(controller, tmp_path):
+    controller.gripper.set("FLT", 5)
+    with pytest.raises(UserError, match="reports fault 5"):
+        make_robot(controller, tmp_path).connect()
+
+
+def test_a_gripper_that_does_not_become_active_is_said(controller, tmp_path, monkeypatch):
+    monkeypatch.setattr("lerobot_uca.robots.ur5e.gripper.ACTIVATION_TIMEOUT", 0.2)
+    registers = controller.gripper.get
+    controller.gripper.get = lambda name: 1 if name == "STA" else registers(name)
+    with pytest.raises(UserError, match="did not become active"):
+        make_robot(controller, tmp_path).connect()
+    assert controller.robot.runtime == Runtime.STOPPED
+
+
+def test_a_silent_urcap_is_said(tmp_path):
+    with Controller(address=free_address()) as controller, socket.create_server((controller.address, 63352)):
+        with pytest.raises(UserError, match=r"63352 takes connections but did not answer within 2 s"):
+            make_robot(controller, tmp_path).connect()
+        assert controller.robot.runtime == Runtime.STOPPED
+
+
+def test_fingers_move_only_when_the_arm_is_at_the_first_action(controller, robot):
+    mover = threading.Thread(target=robot.send_action, args=[action_at(HOME + 0.25, gripper=1.0)])
+    mover.start()
+    wait_until(lambda: speed(controller) > 0.1)
+    assert controller.gripper.get("POS") == OPEN_COUNT
+    mover.join()
+    wait_until(lambda: controller.gripper.get("POS") == CLOSED_COUNT)
+
+
+def test_disconnecting_stops_the_fingers(controller, tmp_path):
+    with make_robot(controller, tmp_path) as robot:
+        robot.send_action(action_at(HOME, gripper=1.0))
+        wait_until(lambda: controller.gripper.get("POS") > OPEN_COUNT)
+    stopped = controller.gripper.get("POS")
+    assert stopped < CLOSED_COUNT
+    time.sleep(0.3)
+    assert controller.gripper.get("POS") == stopped
+
+
 def test_a_firmware_that_was_not_tried_is_said_and_works(tmp_path, caplog):
     with (
         Controller(address=free_address(), firmware=(5, 19, 0, 1000)) as controller,
@@ -415,9 +572,19 @@ def test_a_missing_client_names_the_extra(controller, tmp_path, monkeypatch):
         make_robot(controller, tmp_path).connect()
 
 
-def test_clipping_is_said_once_a_second(caplog):
+def test_clipping_is_said_once_a_second(caplog, monkeypatch):
     caplog.set_level(logging.WARNING)
-    report = ClippingReport(every=math.inf)
+    report, now = ClippingReport(), 100.0
+    monkeypatch.setattr("lerobot_uca.robots.ur5e.ur5e_follower.time.monotonic", lambda: now)
     for size in (0.1, 0.3, 0.2):
         report.note(np.array([0, size, 0, 0, 0, 0]))
-    assert caplog.messages == ["1 targets were clipped, by up to 0.100 rad (shoulder_lift)."]
+        now += 0.4
+    now += 0.4
+    report.note(np.zeros(6))
+    report.note(np.array([0, 0, 0.05, 0, 0, 0]))
+    report.say()  # as disconnecting does
+    assert caplog.messages == [
+        "1 targets were clipped, by up to 0.100 rad (shoulder_lift).",
+        "2 targets were clipped, by up to 0.300 rad (shoulder_lift).",
+        "1 targets were clipped, by up to 0.050 rad (elbow).",
+    ]

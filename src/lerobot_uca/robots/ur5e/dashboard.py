@@ -87,10 +87,10 @@ def check_controller(ip: str) -> None:
             raise UserError(f"The arm is not ready (robot mode {mode}): power it on and release the brakes first.")
         if dashboard.ask("is in remote control") == "false":
             raise UserError("The controller is in local control: switch to remote control, top right on the pendant.")
-        if "true" in dashboard.ask("running"):
+        if (program := dashboard.ask("programState")).startswith(("PLAYING", "PAUSED")):
             raise UserError(
-                f"A program runs on {ip} already ({dashboard.ask('programState')}): another client or the pendant "
-                "holds the arm. Stop it there first; two would steer it at once."
+                f"A program runs on {ip} already ({program}): another client or the pendant holds the arm. Stop it "
+                "there first; two would steer it at once."
             )
     finally:
         dashboard.close()
@@ -105,3 +105,12 @@ def _check_firmware(answer: str) -> None:
     if f"{found[1]}.{found[2]}" not in TESTED_FIRMWARE:
         tested = ", ".join(TESTED_FIRMWARE)
         logger.warning("PolyScope %s has not been tried with this driver (tried: %s). Begin slowly.", found[0], tested)
+
+
+def stop_program(ip: str) -> None:
+    """End the program on a controller, also a paused one."""
+    dashboard = Dashboard(ip)
+    try:
+        dashboard.ask("stop")
+    finally:
+        dashboard.close()

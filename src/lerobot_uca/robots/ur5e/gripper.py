@@ -37,6 +37,12 @@ class RobotiqGripper:
         try:
             self._activate()
             self._position = self._read_position()
+        except TimeoutError:
+            self._connection.close()
+            raise UserError(
+                f"The gripper's URCap at {ip}:{PORT} takes connections but did not answer within {TIMEOUT:.0f} s: see "
+                "its page on the pendant."
+            ) from None
         except BaseException:
             self._connection.close()
             raise
@@ -82,6 +88,7 @@ class RobotiqGripper:
                 with self._lock:
                     self._position, self._heard_at = position, time.monotonic()
                 self._closing.wait(0.005)
+            self._ask("SET GTO 0")  # or they would go on to where they were sent
         except (OSError, ArmStoppedError) as error:
             with self._lock:
                 self._failure = str(error) or type(error).__name__
@@ -103,7 +110,7 @@ class RobotiqGripper:
         return (count - OPEN_COUNT) / (CLOSED_COUNT - OPEN_COUNT)
 
     def close(self) -> None:
-        """Hang up. The fingers stay where they are."""
+        """The fingers stop where they are; hang up."""
         self._closing.set()
         self._thread.join(TIMEOUT)
         with contextlib.suppress(OSError):

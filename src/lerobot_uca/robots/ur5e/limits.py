@@ -90,3 +90,9 @@ class Interpolator:
         self._elapsed += dt
         self.q, self.qd = step_towards(self.q, self.qd, self._reference(), self._limits, dt)
         return self.q
+
+    def brake(self, dt: float) -> Array:
+        """The setpoint (6,) a time dt later if it comes to a stand. `step` then goes on from there."""
+        self.qd = np.sign(self.qd) * np.maximum(np.abs(self.qd) - self._limits.acceleration * dt, 0)
+        self.q = self.q + self.qd * dt
+        return self.q

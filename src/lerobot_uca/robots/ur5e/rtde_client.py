@@ -29,12 +29,15 @@ from lerobot_uca.robots.ur5e.channel import (
     decode,
     encode,
 )
+from lerobot_uca.robots.ur5e.dashboard import stop_program
 from lerobot_uca.robots.ur5e.limits import Interpolator
 from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 
-# [s] Without new data from the controller: first the setpoint stays where it is, then this ends. A busy computer may
+# [s] Without new data from the controller: first the setpoint brakes, then this ends. A busy computer may
 # well wait for half a second, and its arm stands still meanwhile.
 FREEZE_AFTER, STALE_AFTER = 0.1, 1.0
+SAFEGUARD_STOP = 5  # RTDE's safety_mode
+PAUSED = {3, 4, 5}  # RTDE's runtime_state: pausing, paused, resuming
 WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
 BRAKING = 4.0  # [rad/s^2], of servoStop
 
@@ -92,7 +95,8 @@ class ServoLoop:
         self._interpolator = Interpolator(np.array(self._receive.getActualQ()), settings.limits)
         self._is_servoing = False
         self._idle_since = time.monotonic()
-        self._control.setWatchdog(WATCHDOG_RATE)
+        if not self._control.setWatchdog(WATCHDOG_RATE):
+            raise ArmStoppedError(f"The program on {settings.ip} did not take its watchdog; nothing has moved.")
 
     def run(self) -> None:
         """Until the driver says stop or is gone. Raises `ArmStoppedError` where the arm cannot go on."""
@@ -126,6 +130,10 @@ class ServoLoop:
                 "Protective stop: the arm met something or was to leave its limits. Find the cause, unlock it on the "
                 "pendant (after 5 s), start again."
             )
+        if receive.getSafetyMode() == SAFEGUARD_STOP:
+            raise ArmStoppedError("Safeguard stop: leave the guarded area, reset it, start again.")
+        if receive.getRuntimeState() in PAUSED:
+            raise ArmStoppedError("The program on the controller was paused on the pendant.")
         if not self._control.isProgramRunning():
             raise ArmStoppedError("The program on the controller was stopped: on the pendant, or by another client.")
 
@@ -151,7 +159,8 @@ class ServoLoop:
         if not self._is_servoing:
             self._control.kickWatchdog()
             return
-        q = self._interpolator.q if self._age > FREEZE_AFTER else self._interpolator.step(self._period)
+        stale = self._age > FREEZE_AFTER
+        q = self._interpolator.brake(self._period) if stale else self._interpolator.step(self._period)
         settings = self._settings
         if not self._control.servoJ(q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain):
             raise ArmStoppedError("The controller did not take a target: its program is not running.")
@@ -171,15 +180,21 @@ class ServoLoop:
     def brake(self) -> None:
         """Stand still, and stay so."""
         self._is_servoing = False
-        self._control.servoStop(BRAKING)
+        if not self._control.servoStop(BRAKING):
+            raise ArmStoppedError("The controller did not take the command to brake; its program was ended.")
 
     def end(self) -> None:
         """Brake and end the program, if the arm can still be reached; otherwise its own watchdog does."""
         receive, control = self._receive, self._control
-        reached = receive.isConnected() and control.isConnected() and self._age < STALE_AFTER
-        if reached and control.isProgramRunning():
-            self.brake()
-            control.stopScript()
+        if not (receive.isConnected() and control.isConnected() and self._age < STALE_AFTER):
+            return
+        if receive.getRuntimeState() in PAUSED:
+            stop_program(self._settings.ip)  # it obeys nobody else, and resumed would move to its last target
+        elif control.isProgramRunning():
+            try:
+                self.brake()
+            finally:
+                control.stopScript()
 
 
 def main() -> None:

@@ -124,7 +124,7 @@ class RtdeProcess:
         """The arm's next target."""
         self._send(target)
 
-    def _send(self, message: Settings | Target | Stop) -> None:
+    def _send(self, message: Settings | Target) -> None:
         try:
             self._socket.sendall(encode(message))
         except OSError:
@@ -132,10 +132,12 @@ class RtdeProcess:
                 self._changed.wait_for(lambda: self._failure is not None, 1.0)
                 self._raise_failure()
 
-    def stop(self) -> None:
-        """The arm brakes, its program ends, the process ends."""
-        with contextlib.suppress(ArmStoppedError):
-            self._send(Stop())
+    def stop(self, reason: str) -> None:
+        """The arm brakes, its program ends, the process ends. Whoever still uses it is told the reason."""
+        with self._changed:
+            self._failure = self._failure or reason
+        with contextlib.suppress(OSError):  # it has ended by itself
+            self._socket.sendall(encode(Stop()))
         try:
             self._process.wait(STOP_TIMEOUT)
         except subprocess.TimeoutExpired:

@@ -139,7 +139,11 @@ class UR5eFollower(Robot):
             values = self._tcp_near = pose_to_vector(pose_from_vector(state.tcp), near=self._tcp_near)
         observation: RobotObservation = dict(zip(self._keys, values.tolist(), strict=False))
         if self._gripper is not None:
-            observation[GRIPPER_KEY] = self._gripper.position
+            try:
+                observation[GRIPPER_KEY] = self._gripper.position
+            except ArmStoppedError:
+                self._arm.stop("The gripper no longer answers; the arm was stopped.")
+                raise
         for name, camera in self.cameras.items():
             try:
                 if getattr(camera, "use_rgb", True):
@@ -147,8 +151,9 @@ class UR5eFollower(Robot):
                 if getattr(camera, "use_depth", False):
                     observation[f"{name}_depth"] = camera.read_latest_depth()
             except (TimeoutError, RuntimeError, ConnectionError) as error:
-                self._arm.stop()
-                raise ArmStoppedError(f"Camera '{name}' gives no pictures ({error}); the arm was stopped.") from error
+                message = f"Camera '{name}' gives no pictures ({error}); the arm was stopped."
+                self._arm.stop(message)
+                raise ArmStoppedError(message) from error
         return observation
 
     @check_if_not_connected
@@ -156,15 +161,23 @@ class UR5eFollower(Robot):
         """Command the arm, and return what was really commanded.
 
         The first action, and the first one after a pause, is approached slowly, and the call returns when the arm is
-        there. After that targets are clipped: to the joint range, in step and velocity.
+        there; then the gripper follows. After that targets are clipped: to the joint range, in step and velocity.
+
+        Raises:
+            ArmStoppedError: the arm stands still, also because this action was refused: of a caller that sends such
+                things, the next one may not be meant either (LeRobot's rollout would drive the arm to its start).
         """
         assert self._arm is not None
-        values = self._checked(action)
         state = self._arm.state()
+        try:
+            values = self._checked(action)
+        except UserError as error:
+            message = f"{error} The arm was stopped."
+            self._arm.stop(message)
+            raise ArmStoppedError(message) from None
         if not state.is_servoing:
             self._previous = np.array(state.q)
         wanted = self._joint_target(values[:6], state)
-        commanded_gripper = [] if self._gripper is None else [self._gripper.request(values[6])]
         if state.is_servoing:
             elapsed = min(time.monotonic() - self._sent_at, self.config.stop_after)
             target = clip_target(wanted, self._previous, self.config.limits, max(elapsed, 1 / self.config.control_rate))
@@ -175,6 +188,7 @@ class UR5eFollower(Robot):
             self._clipping.note(wanted - target)
             self._ease(target)
         self._previous, self._sent_at = target, time.monotonic()
+        commanded_gripper = [] if self._gripper is None else [self._gripper.request(values[6])]
         commanded = target if self.config.action == "joints" else self._tcp_at(target, state)
         return dict(zip(self._keys, [*commanded.tolist(), *commanded_gripper], strict=True))
 
@@ -190,7 +204,7 @@ class UR5eFollower(Robot):
         values = np.array([float(action[key]) for key in self._keys])  # replay hands over tensors without dimensions
         if not np.isfinite(values).all():
             bad = ", ".join(key for key, value in zip(self._keys, values, strict=True) if not math.isfinite(value))
-            raise UserError(f"An action's values are finite numbers, got others for {bad}; the arm holds its position.")
+            raise UserError(f"An action's values are finite numbers, got others for {bad}.")
         if self.config.action == "joints" and (largest := np.abs(values[:6]).max()) > MEANT_IN_RADIANS:
             raise UserError(f"Joint actions are angles in radians, within 2 pi of zero, got {largest:.1f}. Degrees?")
         return values
@@ -210,14 +224,23 @@ class UR5eFollower(Robot):
         return pose_to_vector(flange_pose(q) @ _tool(state), near=self._tcp_near)
 
     def _ease(self, target: Array) -> None:
-        """Go to a target slowly and wait for it."""
+        """Go to a target slowly and wait for it.
+
+        Step by step, as if a policy went there: should this process be suspended or killed, so ends the way.
+        """
         assert self._arm is not None
-        distance = np.abs(target - self._previous).max()
-        duration = max(distance / self.config.ease_velocity, 1 / self.config.control_rate)
-        if distance > self.config.max_step:
-            joint = JOINTS[int(np.abs(target - self._previous).argmax())]
-            logger.warning("The first target is %.2f rad away (%s): easing there in %.0f s.", distance, joint, duration)
-        self._arm.send(Target(tuple(target.tolist()), duration))
+        config, start = self.config, self._previous
+        speed, period = min(config.ease_velocity, config.max_velocity), 1 / config.control_rate
+        distance = np.abs(target - start).max()
+        n_steps = max(1, math.ceil(distance / speed / period))
+        if distance > config.max_step:
+            joint = JOINTS[int(np.abs(target - start).argmax())]
+            seconds = n_steps * period
+            logger.warning("The first target is %.2f rad away (%s): easing there in %.0f s.", distance, joint, seconds)
+        for step in range(1, n_steps + 1):
+            self._arm.state()  # raises where the arm has stopped
+            self._arm.send(Target(tuple((start + step / n_steps * (target - start)).tolist()), period))
+            time.sleep(period)
 
         settled_at = math.inf
 
@@ -227,15 +250,21 @@ class UR5eFollower(Robot):
                 settled_at = min(settled_at, time.monotonic() + SETTLING)
             return time.monotonic() > settled_at or (state.is_servoing and _distance(state, target).max() < ARRIVED)
 
-        away = _distance(self._arm.wait_for(is_there, 2 * duration + 5, "The pose of the first action"), target)
+        try:
+            timeout = 5 + speed / config.max_acceleration
+            away = _distance(self._arm.wait_for(is_there, timeout, "The pose of the first action"), target)
+        except ArmStoppedError as error:
+            self._arm.stop(str(error))
+            raise
         if away.max() > ARRIVED:
             joint = JOINTS[int(away.argmax())]
             logger.warning("The arm is held %.3f rad away from the first target (%s).", away.max(), joint)
 
     def disconnect(self) -> None:
-        """The arm brakes and stands still; its program ends."""
+        """The arm brakes and stands still, the fingers too; its program ends."""
+        self._clipping.say()
         if self._arm is not None:
-            self._arm.stop()
+            self._arm.stop("The arm was disconnected.")
             self._arm = None
         if self._gripper is not None:
             self._gripper.close()
@@ -274,7 +303,12 @@ class ClippingReport:
         if np.abs(clipped).max() > NOTICEABLE:
             self._n += 1
             self._largest = np.maximum(self._largest, np.abs(clipped))
-        if self._n and time.monotonic() >= self._due:
+        if time.monotonic() >= self._due:
+            self.say()
+
+    def say(self) -> None:
+        """Say what has not been said yet."""
+        if self._n:
             joint = int(self._largest.argmax())
             logger.warning(
                 "%d targets were clipped, by up to %.3f rad (%s).", self._n, self._largest[joint], JOINTS[joint]

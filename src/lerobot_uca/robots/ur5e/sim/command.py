@@ -3,6 +3,7 @@
 import argparse
 import logging
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -11,6 +12,7 @@ from typing import Self
 from lerobot_uca.point_clouds.calibration import Calibration
 from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 from lerobot_uca.robots.ur5e.sim.controller import Controller
+from lerobot_uca.robots.ur5e.sim.robot import Runtime
 from lerobot_uca.robots.ur5e.sim.scene import TASKS, TOOL_LENGTH, Scene
 from lerobot_uca.robots.ur5e.sim.scene_service import FAULTS, PORT, SERIAL, Noise, SceneService, simulated_camera
 from lerobot_uca.robots.ur5e.sim.servers import Server
@@ -60,7 +62,9 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--noise", type=float, default=0.0, help="of depth at a distance of 1 m [m] [%(default)s]")
     parser.add_argument("--holes", type=float, default=0.0, help="share of pixels without depth [%(default)s]")
     parser.add_argument("--fault", choices=FAULTS, default="none", help="what breaks [%(default)s]")
-    parser.add_argument("--after", type=float, default=5.0, help="seconds until it breaks [%(default)s]")
+    parser.add_argument(
+        "--after", type=float, default=5.0, help="seconds until it breaks, once a client steers the arm [%(default)s]"
+    )
     parser.add_argument("--calibration", type=Path, help="folder to write the camera's calibration to")
     parser.add_argument("--camera", default="top", help="its name in the robot's configuration [%(default)s]")
     parser.add_argument("--width", type=int, default=160, help="of the calibrated image [pixels] [%(default)s]")
@@ -84,5 +88,8 @@ def main() -> None:
             options.ip,
         )
         if options.fault != "none":
-            threading.Timer(options.after, world.service.fault, [options.fault]).start()
+            while world.controller.robot.runtime != Runtime.PLAYING:
+                time.sleep(0.05)
+            time.sleep(options.after)
+            world.service.fault(options.fault)
         threading.Event().wait()

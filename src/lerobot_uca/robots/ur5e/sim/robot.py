@@ -30,6 +30,7 @@ class Runtime(IntEnum):
 
     STOPPED = 1
     PLAYING = 2
+    PAUSED = 4
 
 
 class Safety(IntEnum):
@@ -37,10 +38,16 @@ class Safety(IntEnum):
 
     NORMAL = 1
     PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
     ROBOT_EMERGENCY_STOP = 7
 
 
-SAFETY_BITS = {Safety.NORMAL: 1 << 0, Safety.PROTECTIVE_STOP: 1 << 2 | 1 << 10, Safety.ROBOT_EMERGENCY_STOP: 0b11 << 6}
+SAFETY_BITS = {
+    Safety.NORMAL: 1 << 0,
+    Safety.PROTECTIVE_STOP: 1 << 2 | 1 << 10,
+    Safety.SAFEGUARD_STOP: 1 << 4 | 1 << 10,
+    Safety.ROBOT_EMERGENCY_STOP: 0b11 << 6,
+}
 
 
 class Command(IntEnum):
@@ -224,6 +231,19 @@ class Robot:
     def emergency_stop(self) -> None:
         """Stop as if somebody had pressed the button."""
         self._stop(Safety.ROBOT_EMERGENCY_STOP, "emergency stop")
+
+    def safeguard_stop(self) -> None:
+        """Stop as if somebody had stepped into the guarded area: the program is paused, not gone."""
+        was_playing = self.runtime == Runtime.PLAYING
+        self._stop(Safety.SAFEGUARD_STOP, "somebody is in the guarded area")
+        if was_playing:
+            self.runtime = Runtime.PAUSED
+
+    def leave_guarded_area(self) -> None:
+        """A paused program goes on, to its last target."""
+        self.safety = Safety.NORMAL
+        if self.runtime == Runtime.PAUSED:
+            self.runtime = Runtime.PLAYING
 
     def _stop(self, safety: Safety, reason: str) -> None:
         logger.warning("%s: %s.", safety.name, reason)

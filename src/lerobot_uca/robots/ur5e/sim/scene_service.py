@@ -22,14 +22,16 @@ from lerobot_uca.point_clouds.geometry import Camera, as_pose
 from lerobot_uca.robots.ur5e.kinematics import Array
 from lerobot_uca.robots.ur5e.sim.controller import Controller
 from lerobot_uca.robots.ur5e.sim.scene import Scene
+from lerobot_uca.robots.ur5e.sim.servers import RTDE_PORT
 
 PORT = 30010
 POSITION, LOOKS_AT = np.array([-0.95, 0.0, 0.85]), np.array([-0.47, 0.0, 0.0])  # [m]
 FIELD_OF_VIEW = math.radians(69)  # horizontal, a D435's colour camera
 SERIAL = "simulated"
+LATENCY, DROPPED = 0.05, 0.1  # [s], share of the packets: of the faults of these names
 FAULTS = (
-    *("protective_stop", "emergency_stop", "silent_rtde", "gone", "latency", "dropped_packets"),
-    *("stale_frames", "dead_camera", "none"),
+    *("protective_stop", "safeguard_stop", "emergency_stop", "silent_rtde", "gone", "latency", "dropped_packets"),
+    *("killed_client", "stale_frames", "dead_camera", "none"),
 )
 
 
@@ -137,17 +139,30 @@ class SceneService:
         network, robot = self._controller.network, self._controller.robot
         faults = {
             "protective_stop": lambda: robot.protective_stop("injected"),
+            "safeguard_stop": robot.safeguard_stop,
             "emergency_stop": robot.emergency_stop,
             "silent_rtde": lambda: setattr(network, "is_silent", True),
             "gone": self._controller.vanish,
-            "latency": lambda: setattr(network, "latency", 0.02),
-            "dropped_packets": lambda: setattr(network, "drop", 0.1),
+            "latency": lambda: setattr(network, "latency", LATENCY),
+            "dropped_packets": lambda: setattr(network, "drop", DROPPED),
+            "killed_client": lambda: kill_clients(self._controller.address),
             "stale_frames": lambda: setattr(self, "_camera_fault", name),
             "dead_camera": lambda: setattr(self, "_camera_fault", name),
             "none": lambda: setattr(self, "_camera_fault", ""),
         }
         with self._lock:
             faults[name]()
+
+
+def kill_clients(ip: str) -> None:
+    """Kill the processes that a controller's RTDE serves, which on a loopback address are this machine's."""
+    try:
+        import psutil
+    except ImportError as error:
+        raise UserError("This fault needs psutil: pip install 'lerobot_policy_uca_flow[ur5e-sim]'.") from error
+    for connection in psutil.net_connections("tcp4"):
+        if connection.raddr == (ip, RTDE_PORT) and connection.pid is not None:
+            psutil.Process(connection.pid).kill()
 
 
 class SceneClient:

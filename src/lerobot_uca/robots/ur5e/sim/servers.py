@@ -201,7 +201,7 @@ class Dashboard:
         }
         self._of_state: dict[str, Callable[[], str]] = {
             "running": lambda: f"Program running: {str(self._is_playing).lower()}",
-            "programState": lambda: "PLAYING rtde_control" if self._is_playing else "STOPPED <unnamed>",
+            "programState": lambda: f"{robot.runtime.name} rtde_control",
             "safetymode": lambda: f"Safetymode: {robot.safety.name}",
             "safetystatus": lambda: f"Safetystatus: {robot.safety.name}",
             "is in remote control": lambda: str(self.is_remote).lower(),
