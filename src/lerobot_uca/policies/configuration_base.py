@@ -60,6 +60,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {"STATE": NormalizationMode.MIN_MAX, "ACTION": NormalizationMode.MIN_MAX}
     )
+    # A robot state's dimension that moves less in the data, in the feature's unit, counts as constant: stretched to
+    # [-1, 1], a joint's measuring noise would be a large signal, and far larger where the joint is held elsewhere.
+    min_state_range: float = within(1e-4, least=1e-4)
 
     # Widths of the point encoder's layers (the baselines').
     point_widths: tuple[int, ...] = within((64, 128, 256), least=1, most=8192)

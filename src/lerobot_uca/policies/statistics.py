@@ -22,9 +22,12 @@ Statistics = dict[str, dict[str, NDArray[np.float64]]]
 """Statistics by feature and name (min, max, mean, std, q01, ...), each (D,)."""
 
 MIN_RANGE = 1e-4
-"""A range below it, in the feature's unit, counts as constant, as in DP3 and the other baselines ..."""
+"""A range below it, in the feature's unit, counts as constant, as in DP3 and the other baselines (of states, a policy's
+`min_state_range` does) ..."""
 MIN_RELATIVE_RANGE = 1e-6
 """... and so does one below this share of the values: it is float32's rounding."""
+SUSPICIOUS_SHARE = 0.01
+"""A state's dimension that moves by less than this share of the widest may be a sensor's noise, which is said."""
 
 BOUNDS = {
     NormalizationMode.MIN_MAX: ("min", "max"),
@@ -82,11 +85,30 @@ def settled_statistics(
         settled[key] = {name: _vector(values) for name, values in named.get(key, {}).items()}
         check_statistics(key, settled[key], config, where=f"the dataset's ({', '.join(stats)})")
         if names:
-            dimensions = _widen(settled[key])
+            ranges = _ranges(settled[key])
+            least = config.min_state_range if key == OBS_STATE else MIN_RANGE
+            dimensions = _widen(settled[key], least)
             constant += [f"{key}{dimensions.tolist()}"] if len(dimensions) else []
+            if key == OBS_STATE and ranges is not None:
+                _say_if_noise(np.delete(ranges, dimensions), np.delete(np.arange(len(ranges)), dimensions))
     if constant:
         logger.warning("(Nearly) constant in the data, so not stretched by normalisation: %s", ", ".join(constant))
     return settled
+
+
+def _ranges(stats: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64] | None:
+    return stats["max"] - stats["min"] if {"min", "max"} <= set(stats) else None
+
+
+def _say_if_noise(ranges: NDArray[np.float64], dimensions: NDArray[np.intp]) -> None:
+    """Of dimensions that normalisation stretches: those that hardly move beside the widest."""
+    small = ranges < SUSPICIOUS_SHARE * ranges.max(initial=0)
+    if small.any():
+        logger.warning(
+            "%s%s moves by %.2g or less, another dimension by %.2g. If that is a sensor's noise, a greater "
+            "--policy.min_state_range (its unit) keeps normalisation from stretching it to [-1, 1].",
+            *(OBS_STATE, dimensions[small].tolist(), ranges[small].max(), ranges.max()),
+        )
 
 
 def check_statistics(key: str, stats: Mapping[str, Any], config: PointCloudPolicyConfig, *, where: str) -> None:
@@ -102,8 +124,8 @@ def check_statistics(key: str, stats: Mapping[str, Any], config: PointCloudPolic
             raise UserError(f"'{name}' of '{key}' in {where} statistics must be finite, got {values}.")
 
 
-def _widen(stats: dict[str, NDArray[np.float64]]) -> NDArray[np.intp]:
-    """Replace degenerate bounds and deviations in place. Returns the dimensions that are constant."""
+def _widen(stats: dict[str, NDArray[np.float64]], least: float) -> NDArray[np.intp]:
+    """Replace degenerate bounds and deviations, ranges below `least`, in place. Returns the constant dimensions."""
     constant: NDArray[np.bool_] | None = None
     for low, high in BOUNDS.values():
         if low not in stats or high not in stats:
@@ -112,7 +134,7 @@ def _widen(stats: dict[str, NDArray[np.float64]]) -> NDArray[np.intp]:
         unit = np.maximum(
             1.0, 1e3 * MIN_RELATIVE_RANGE * np.abs(centre)
         )  # of 1e8 - 1 and 1e8 + 1 float32 keeps nothing
-        degenerate = stats[high] - stats[low] < np.maximum(MIN_RANGE, MIN_RELATIVE_RANGE * np.abs(centre))
+        degenerate = stats[high] - stats[low] < np.maximum(least, MIN_RELATIVE_RANGE * np.abs(centre))
         stats[low] = np.where(degenerate, centre - unit, stats[low])
         stats[high] = np.where(degenerate, centre + unit, stats[high])
         if low == "min":
