@@ -48,11 +48,11 @@ TASKS = {
         9,
         crop=("[-0.63, -0.3, 0.005]", "[-0.36, 0.3, 0.15]"),
         n_points=512,
-        steps=1200,
+        steps=6000,
         options="--policy.n_points=128",
     ),
     "drawer_close": Task(
-        "Close the drawer.", 5, crop=("[-0.8, -0.45, 0.005]", "[-0.2, 0.35, 0.5]"), n_points=1024, steps=500
+        "Close the drawer.", 5, crop=("[-0.8, -0.45, 0.005]", "[-0.2, 0.35, 0.5]"), n_points=1024, steps=1500
     ),
 }
 METHODS = {

