@@ -6,6 +6,8 @@ images' bytes: depth (H, W) uint16 [mm], 0 where nothing was measured, then colo
 
 import json
 import math
+import os
+import signal
 import socket
 import threading
 from dataclasses import dataclass
@@ -160,9 +162,10 @@ def kill_clients(ip: str) -> None:
         import psutil
     except ImportError as error:
         raise UserError("This fault needs psutil: pip install 'lerobot_policy_uca_flow[ur5e-sim]'.") from error
-    for connection in psutil.net_connections("tcp4"):
-        if connection.raddr == (ip, RTDE_PORT) and connection.pid is not None:
-            psutil.Process(connection.pid).kill()
+    connections = psutil.net_connections("tcp4")
+    clients = {each.pid for each in connections if each.raddr == (ip, RTDE_PORT)} - {None}  # two connections a client
+    for client in clients:
+        os.kill(client, signal.SIGKILL)
 
 
 class SceneClient:
