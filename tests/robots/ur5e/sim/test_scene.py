@@ -2,10 +2,12 @@ import sys
 
 import numpy as np
 import pytest
+from tests.robots.conftest import free_address, wait_until
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.cameras import DepthCamera
 from lerobot_uca.robots.ur5e.kinematics import flange_pose
+from lerobot_uca.robots.ur5e.sim.command import SimulatedWorld
 from lerobot_uca.robots.ur5e.sim.demonstrator import plan, way_home
 from lerobot_uca.robots.ur5e.sim.gripper import SimulatedGripper
 from lerobot_uca.robots.ur5e.sim.motion import Servo
@@ -105,3 +107,30 @@ def test_missing_models_name_the_extra(monkeypatch):
 def test_an_unknown_task_is_refused(scene):
     with pytest.raises(UserError, match="pick_place, drawer_close, got 'juggle'"):
         scene.reset("juggle", seed=0)
+
+
+def test_fingers_go_where_they_are_sent_and_measure_so():
+    """Else each rollout, which ends where it measured that it began, left them a little more closed."""
+    scene = Scene()
+    gripper = SimulatedGripper(scene.fingers)
+    gripper.set("ACT", 1)
+    gripper.set("GTO", 1)
+    for count in (3, 16, 120, 3):
+        gripper.set("POS", count)
+        for _ in range(800):
+            scene.arm.follow(np.array(HOME), CYCLE)
+            gripper.cycle(CYCLE)
+        assert abs(gripper.get("POS") - count) <= (0 if count < 20 else 2)
+
+
+def test_a_world_put_back_has_its_gripper_open():
+    with SimulatedWorld(free_address()) as world:
+        with world.controller.robot.lock:
+            for name, value in {"ACT": 1, "GTO": 1, "POS": 100}.items():
+                world.controller.gripper.set(name, value)
+        wait_until(lambda: world.controller.gripper.get("POS") > 90)
+        world.service.reset("pick_place", seed=0, with_arm=True)
+        assert world.controller.gripper.get("POS") <= 3
+        time = world.scene.data.time
+        wait_until(lambda: world.scene.data.time > time + 0.5)
+        assert world.controller.gripper.get("POS") == 3

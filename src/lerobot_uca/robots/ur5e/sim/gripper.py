@@ -58,6 +58,10 @@ class SimulatedGripper:
             return 3 if self._registers["ACT"] else 0
         return self._object if name == "OBJ" else self._registers.get(name, 0)
 
+    def fingers_were_opened(self) -> None:
+        """Somebody has opened simulated fingers: they stay so."""
+        self._registers["PRE"], self._commanded = OPEN_COUNT, float(OPEN_COUNT)
+
     def cycle(self, dt: float) -> None:
         """Some time of the gripper."""
         if self._registers["ACT"] and self._registers["GTO"]:

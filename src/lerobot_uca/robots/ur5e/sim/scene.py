@@ -26,6 +26,7 @@ CUBE_LOW, CUBE_HIGH = np.array([-0.58, -0.18]), np.array([-0.42, -0.04])  # [m],
 OPEN_LOW, OPEN_HIGH = 0.09, 0.13  # [m], how far the drawer begins open
 CLOSED = 0.01  # [m]
 FULLY_CLOSED = 0.8  # [rad], the gripper's driver joint at 255 counts
+SPRING = 0.003  # [rad], by which the gripper's springs hold that joint away from where its actuator wants it
 
 
 def build_model() -> mujoco.MjModel:
@@ -99,14 +100,16 @@ class Scene:
         self.reset("pick_place", seed=0, with_arm=True)
 
     def reset(self, task: str, seed: int, *, with_arm: bool = False) -> None:
-        """Put the things where an episode begins; only with `with_arm` is the arm put home, too."""
+        """Put the things where an episode begins; only with `with_arm` is the arm put home, and its gripper open."""
         if task not in TASKS:
             raise UserError(f"The task is one of {', '.join(TASKS)}, got '{task}'.")
         rng = np.random.default_rng(seed)
         data = self.data
         if with_arm:
+            time = data.time
+            mujoco.mj_resetData(self.model, data)  # or fingers stayed as the last episode left them
+            data.time = time  # by which a camera knows a new frame
             data.qpos[:6] = data.ctrl[:6] = HOME
-            data.qvel[:6] = 0
         x, y = rng.uniform(CUBE_LOW, CUBE_HIGH)
         yaw = rng.uniform(-np.pi / 8, np.pi / 8)
         data.joint("cube").qpos = [x, y, CUBE_SIZE / 2, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
@@ -169,7 +172,7 @@ class MujocoFingers:
     @property
     def count(self) -> float:
         """Measured: 0 open, 255 closed."""
-        return float(self._scene.data.joint("gripper_right_driver_joint").qpos[0]) / FULLY_CLOSED * 255
+        return (float(self._scene.data.joint("gripper_right_driver_joint").qpos[0]) - SPRING) / FULLY_CLOSED * 255
 
     def follow(self, count: float, dt: float) -> None:
         """Until the physics' next step."""

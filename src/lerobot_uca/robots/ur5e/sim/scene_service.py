@@ -105,12 +105,14 @@ class SceneService:
         raise UserError(f"A request is frame, reset, state or fault, got '{request['request']}'.")
 
     def reset(self, task: str, seed: int, *, with_arm: bool = False) -> None:
-        """Put the things where an episode begins; `with_arm` only while no client moves it: the arm, too."""
+        """Put the things where an episode begins; `with_arm` only while no client moves it: arm and fingers, too."""
         with self._lock:
             self._scene.reset(task, seed, with_arm=with_arm)
             self._task = task
             if with_arm:
                 self._controller.robot.arm_was_moved()
+                if self._controller.gripper is not None:
+                    self._controller.gripper.fingers_were_opened()
 
     def _state(self) -> dict[str, Any]:
         with self._lock:
