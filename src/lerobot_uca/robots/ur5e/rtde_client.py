@@ -38,6 +38,7 @@ from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 FREEZE_AFTER, STALE_AFTER = 0.1, 1.0
 SAFEGUARD_STOP = 5  # RTDE's safety_mode
 PAUSED = {3, 4, 5}  # RTDE's runtime_state: pausing, paused, resuming
+NEXT_DATA = 0.05  # [s]
 WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
 BRAKING = 4.0  # [rad/s^2], of servoStop
 
@@ -137,6 +138,11 @@ class ServoLoop:
         if not self._control.isProgramRunning():
             raise ArmStoppedError("The program on the controller was stopped: on the pendant, or by another client.")
 
+    def _check_again(self) -> None:
+        """A command was refused: what has just happened comes with the next data."""
+        time.sleep(NEXT_DATA)
+        self._check()
+
     @property
     def _age(self) -> float:
         return time.monotonic() - self._changed_at
@@ -163,6 +169,7 @@ class ServoLoop:
         q = self._interpolator.brake(self._period) if stale else self._interpolator.step(self._period)
         settings = self._settings
         if not self._control.servoJ(q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain):
+            self._check_again()
             raise ArmStoppedError("The controller did not take a target: its program is not running.")
 
     def _state(self) -> State:
@@ -181,6 +188,7 @@ class ServoLoop:
         """Stand still, and stay so."""
         self._is_servoing = False
         if not self._control.servoStop(BRAKING):
+            self._check_again()
             raise ArmStoppedError("The controller did not take the command to brake; its program was ended.")
 
     def end(self) -> None:
