@@ -153,15 +153,15 @@ def record(file: Path, clouds: Iterator[NDArray[np.float32]], crop: Crop) -> Non
     except ImportError as error:
         raise UserError("Recordings need rerun-sdk: pip install 'lerobot_policy_uca_flow[view]'.") from error
     recording = rerun.RecordingStream("lerobot_uca")
-    try:
-        with whole_file(file) as unfinished:
+    with whole_file(file) as unfinished:
+        try:
             recording.save(str(unfinished))
-            for index, points in enumerate(clouds):
-                recording.set_time("frame", sequence=index)
-                recording.log("cloud", rerun.Points3D(points[:, :3], colors=colours_of(points, crop), radii=0.003))
-            recording.disconnect()
-    except (OSError, RuntimeError) as error:
-        raise UserError(f"Cannot write '{file}': {error}") from error
+        except (OSError, RuntimeError) as error:  # what reading the clouds raises is not about this file
+            raise UserError(f"Cannot write '{file}': {error}") from error
+        for index, points in enumerate(clouds):
+            recording.set_time("frame", sequence=index)
+            recording.log("cloud", rerun.Points3D(points[:, :3], colors=colours_of(points, crop), radii=0.003))
+        recording.disconnect()
 
 
 def pages_of(config: ViewConfig, clouds: Iterator[NDArray[np.float32]]) -> Iterator[CropPage]:

@@ -141,9 +141,8 @@ class UR5eFollower(Robot):
         if self._gripper is not None:
             try:
                 observation[GRIPPER_KEY] = self._gripper.position
-            except ArmStoppedError:
-                self._arm.stop("The gripper no longer answers; the arm was stopped.")
-                raise
+            except ArmStoppedError as error:
+                raise self._stopped(f"{error} The arm was stopped.") from None
         for name, camera in self.cameras.items():
             try:
                 if getattr(camera, "use_rgb", True):
@@ -151,9 +150,7 @@ class UR5eFollower(Robot):
                 if getattr(camera, "use_depth", False):
                     observation[f"{name}_depth"] = camera.read_latest_depth()
             except (TimeoutError, RuntimeError, ConnectionError) as error:
-                message = f"Camera '{name}' gives no pictures ({error}); the arm was stopped."
-                self._arm.stop(message)
-                raise ArmStoppedError(message) from error
+                raise self._stopped(f"Camera '{name}' gives no pictures ({error}); the arm was stopped.") from error
         return observation
 
     @check_if_not_connected
@@ -172,9 +169,7 @@ class UR5eFollower(Robot):
         try:
             values = self._checked(action)
         except UserError as error:
-            message = f"{error} The arm was stopped."
-            self._arm.stop(message)
-            raise ArmStoppedError(message) from None
+            raise self._stopped(f"{error} The arm was stopped.") from None
         if not state.is_servoing:
             self._previous = np.array(state.q)
         wanted = self._joint_target(values[:6], state)
@@ -191,6 +186,12 @@ class UR5eFollower(Robot):
         commanded_gripper = [] if self._gripper is None else [self._gripper.request(values[6])]
         commanded = target if self.config.action == "joints" else self._tcp_at(target, state)
         return dict(zip(self._keys, [*commanded.tolist(), *commanded_gripper], strict=True))
+
+    def _stopped(self, reason: str) -> ArmStoppedError:
+        """Stop the arm, and the error that says why; whatever is asked afterwards raises it, too."""
+        assert self._arm is not None
+        self._arm.stop(reason)
+        return ArmStoppedError(reason)
 
     def _checked(self, action: RobotAction) -> Array:
         """The action's values in the order of the keys."""
@@ -254,8 +255,7 @@ class UR5eFollower(Robot):
             timeout = 5 + speed / config.max_acceleration
             away = _distance(self._arm.wait_for(is_there, timeout, "The pose of the first action"), target)
         except ArmStoppedError as error:
-            self._arm.stop(str(error))
-            raise
+            raise self._stopped(str(error)) from None
         if away.max() > ARRIVED:
             joint = JOINTS[int(away.argmax())]
             logger.warning("The arm is held %.3f rad away from the first target (%s).", away.max(), joint)
