@@ -80,6 +80,7 @@ def actions_of_lerobots_loop(policy: UCAFlowPolicy, folder: Path, observations: 
         {"n_obs_steps": 3, "obs_stride": 3, "horizon": 8, "n_action_steps": 2},
         {"normalization_mapping": {"STATE": "MEAN_STD", "ACTION": "IDENTITY"}},
         {"augmentation": AugmentationConfig(jitter=0.1)},
+        {"hand_position": (1, 0, 2)},
         {"colour": True, "input_features": coloured_features()},
         {"colour": True, "input_features": coloured_features(), "n_points": 10},
     ],

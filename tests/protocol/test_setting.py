@@ -18,17 +18,24 @@ def test_the_papers_training_lengths():
         assert paper.length(cell).steps == epochs * batches
         assert paper.length(cell).interval == 200 * batches
     assert paper.batch_size == 128
-    assert paper.policy_options("uca_flow") == {"type": "uca_flow"}
+    assert paper.policy_options(REACH) == {"type": "uca_flow"}
 
 
 @pytest.mark.parametrize("name", ["paper", "small"])
 def test_a_setting_of_the_package_trains_every_task_and_policy(name):
     setting = Setting.load(name)
     assert all(setting.length(Cell(task, "uca_flow", 0)).steps for task in SUITES["all"])
-    options = {policy: setting.policy_options(policy) for policy in POLICIES}
+    options = {policy: setting.policy_options(Cell("adroit/pen", policy, 0)) for policy in POLICIES}
     assert len({str(each) for each in options.values()}) == len(POLICIES)
     assert options["adaln"]["conditioning"] == "adaln"
     assert options["without_dual_pass"]["dual_pass"] is False
+
+
+def test_options_of_a_benchmark_are_its_tasks_alone():
+    setting = Setting.load("small")
+    assert setting.policy_options(REACH)["hand_position"] == [0, 1, 2]
+    assert setting.policy_options(REACH._replace(policy="dp3"))["hand_position"] == [0, 1, 2]
+    assert "hand_position" not in setting.policy_options(PEN)
 
 
 def test_no_episode_is_used_twice():
@@ -60,6 +67,10 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
         ({"batch_size": 8}, "is not complete"),
         ({**GOOD, "batch_size": 0}, "batch_size must be a whole number above 0, got 0"),
         ({**GOOD, "lengths": {"metaworld": {"steps": 5, "evaluations": 2}}}, "must be a multiple of its evaluations"),
+        (
+            {**GOOD, "benchmarks": {"libero": {}}},
+            "benchmarks holds options by benchmark (adroit, metaworld), got 'libero'",
+        ),
         (
             {**GOOD, "policies": {"uca": {}}},
             "policies holds options by type (dp3, flowpolicy, mp1, simple_dp3, uca_flow",

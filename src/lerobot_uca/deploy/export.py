@@ -29,7 +29,7 @@ from lerobot_uca.whole_file import whole_file
 # makes them from depth images has nothing to do, nor has the one that changes training's.
 TRACEABLE_STEPS = {
     *("rename_observations_processor", "depth_to_cloud_processor", "point_cloud_processor", "to_batch_processor"),
-    "cloud_augmentation_processor",
+    *("cloud_augmentation_processor", "hand_frame_processor"),
     *("device_processor", "normalizer_processor", "unnormalizer_processor"),
 }
 FILES = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")

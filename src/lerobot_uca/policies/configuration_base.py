@@ -50,6 +50,10 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # Whether the policy sees the points' colours: clouds (N, 6), xyz and RGB, which the dataset must hold.
     colour: bool = False
 
+    # The state's dimensions that hold the hand's x, y and z in the clouds' frame [m], such as [0, 1, 2] in Meta-World:
+    # clouds are then seen from the hand. The paper's and the baselines' clouds, and by default ours, are not.
+    hand_position: tuple[int, ...] | None = None
+
     # Training from depth images, which become clouds.
     depth: DepthConfig = field(default_factory=DepthConfig)
 
@@ -141,6 +145,12 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         for key, feature in ((OBS_STATE, state), (ACTION, action)):
             if len(feature.shape) != 1:
                 raise UserError(f"'{key}' must be a vector, got shape {tuple(feature.shape)}.")
+        hand = self.hand_position
+        if hand is not None and not (len(hand) == len(set(hand)) == 3 and set(hand) <= set(range(state.shape[0]))):
+            raise UserError(
+                f"policy.hand_position must be three different dimensions of '{OBS_STATE}', "
+                f"0 to {state.shape[0] - 1}, or null, got {list(hand)}."
+            )
         self.input_features: dict[str, PolicyFeature] | None = {
             OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (cloud.shape[0], n_channels)),
             OBS_STATE: PolicyFeature(FeatureType.STATE, tuple(state.shape)),

@@ -28,6 +28,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud, valid_mask
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_augmentation import CloudAugmentationProcessorStep, augmentation_steps
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
+from lerobot_uca.policies.processor_hand_frame import HandFrameProcessorStep, hand_frame_steps
 from lerobot_uca.policies.statistics import check_statistics, settled_statistics
 
 logger = logging.getLogger(__name__)
@@ -48,13 +49,15 @@ def make_processors(
         UserError: as `settled_statistics`.
     """
     config.validate_features()
-    steps = make_default_policy_processor_steps(config, settled_statistics(dataset_stats, config))
+    stats = settled_statistics(dataset_stats, config)
+    steps = make_default_policy_processor_steps(config, stats)
     return make_policy_processor_pipelines(
         [
             steps.rename_observations,
             DepthToCloudProcessorStep(recipe=config.depth.recipe),
             PointCloudProcessorStep(config.n_points, config.colour),
             *augmentation_steps(config),
+            *hand_frame_steps(config, stats[OBS_STATE]),
             steps.add_batch_dim,
             steps.to_device,
             steps.normalize,
@@ -105,6 +108,7 @@ def _check_pipelines(
 
     Old checkpoints lack the point-cloud step, and a training that starts from a checkpoint may augment otherwise.
     """
+    state_statistics: dict[str, Any] = {}
     for pipeline, kind, keys in (
         (pre, NormalizerProcessorStep, (OBS_POINT_CLOUD, OBS_STATE, ACTION)),
         (post, UnnormalizerProcessorStep, (ACTION,)),
@@ -118,7 +122,9 @@ def _check_pipelines(
             stats = {name.rpartition("."): value for name, value in step.state_dict().items()}
             stats = {name: value for (of, _, name), value in stats.items() if of == key}
             check_statistics(key, stats, config, where=f"the {kind._registry_name}'s in '{checkpoint}'")
-    steps = [each for each in pre.steps if not isinstance(each, CloudAugmentationProcessorStep)]
+            state_statistics = stats if key == OBS_STATE else state_statistics
+    own = CloudAugmentationProcessorStep, HandFrameProcessorStep
+    steps = [each for each in pre.steps if not isinstance(each, own)]
     kinds = [type(each) for each in steps]
     if PointCloudProcessorStep not in kinds:
         before = RenameObservationsProcessorStep
@@ -126,7 +132,8 @@ def _check_pipelines(
         steps.insert(kinds.index(PointCloudProcessorStep), PointCloudProcessorStep())
     place = kinds.index(PointCloudProcessorStep)
     steps[place] = PointCloudProcessorStep(config.n_points, config.colour)
-    pre.steps = [*steps[: place + 1], *augmentation_steps(config), *steps[place + 1 :]]
+    made = [*augmentation_steps(config), *hand_frame_steps(config, state_statistics)]
+    pre.steps = [*steps[: place + 1], *made, *steps[place + 1 :]]
 
 
 @dataclass

@@ -9,7 +9,7 @@ from typing import Any, Self
 import yaml
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.protocol.cells import POLICIES, SUITES, Cell
+from lerobot_uca.protocol.cells import ENVIRONMENTS, POLICIES, SUITES, Cell
 
 FOLDER = files("lerobot_uca.protocol") / "settings"
 
@@ -54,6 +54,8 @@ class Setting:
     """Episodes of the last checkpoint's evaluation, on seeds that nothing else uses."""
     policy: Mapping[str, Any] = field(default_factory=dict)
     """Options of all policies."""
+    benchmarks: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Further options of all policies by benchmark."""
     policies: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Further options by policy type."""
 
@@ -107,13 +109,14 @@ class Setting:
                     f"Setting '{self.name}': smoothing holds numbers above 0 and up to 1 by 'benchmark/task', "
                     f"got {task}: {smoothing!r}."
                 )
-        types = {method.type for method in POLICIES.values()}
-        for policy_type in self.policies:
-            if policy_type not in types:
-                raise UserError(
-                    f"Setting '{self.name}': policies holds options by type ({', '.join(sorted(types))}), "
-                    f"got '{policy_type}'."
-                )
+        types = sorted({method.type for method in POLICIES.values()})
+        for field_name, what, valid in (("benchmarks", "benchmark", list(ENVIRONMENTS)), ("policies", "type", types)):
+            for name in getattr(self, field_name):
+                if name not in valid:
+                    raise UserError(
+                        f"Setting '{self.name}': {field_name} holds options by {what} ({', '.join(valid)}), "
+                        f"got '{name}'."
+                    )
 
     def as_values(self) -> dict[str, Any]:
         """The setting as plain values, for JSON."""
@@ -126,10 +129,11 @@ class Setting:
                 return self.lengths[key]
         raise UserError(f"Setting '{self.name}' has no length for {cell.task}: lengths of {', '.join(self.lengths)}.")
 
-    def policy_options(self, policy: str) -> dict[str, Any]:
-        """Options of a policy by name, without 'policy.'."""
-        method = POLICIES[policy]
-        return {"type": method.type, **self.policy, **self.policies.get(method.type, {}), **method.options}
+    def policy_options(self, cell: Cell) -> dict[str, Any]:
+        """Options of a cell's policy, without 'policy.'."""
+        method = POLICIES[cell.policy]
+        of_benchmark, of_type = self.benchmarks.get(cell.benchmark, {}), self.policies.get(method.type, {})
+        return {"type": method.type, **self.policy, **of_benchmark, **of_type, **method.options}
 
     def interim_seeds(self, cell: Cell, evaluation: int) -> range:
         """Seeds of the episodes of a cell's evaluation 0, 1, ... during training: the same for all policies."""

@@ -66,7 +66,7 @@ def train(cell_folder: CellFolder, setting: Setting, dataset: Path, lock: TextIO
 def training_options(cell: Cell, setting: Setting) -> dict[str, Any]:
     """Options of a new training, besides its folders."""
     length = setting.length(cell)
-    policy = {f"policy.{name}": value for name, value in setting.policy_options(cell.policy).items()}
+    policy = {f"policy.{name}": value for name, value in setting.policy_options(cell).items()}
     return {
         "dataset.repo_id": repo_id(cell),
         **policy,
