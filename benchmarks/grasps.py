@@ -37,7 +37,9 @@ def main() -> None:
             frames.clear()
         simulator = env._simulator  # only a study looks inside
         fingers = simulator.data.body("rightpad").xpos - simulator.data.body("leftpad").xpos
-        frames.append((simulator.tcp_center.copy(), simulator._get_pos_objects()[:3].copy(), np.linalg.norm(fingers)))
+        frames.append(
+            (simulator.tcp_center.copy(), simulator._get_pos_objects()[:3].copy(), float(np.linalg.norm(fingers)))
+        )
 
     print_provenance()
     seeds = range(FIRST_SEED, FIRST_SEED + args.episodes)
