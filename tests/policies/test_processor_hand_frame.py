@@ -14,7 +14,7 @@ from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from lerobot_uca.policies.processor_augmentation import CloudAugmentationProcessorStep
 from lerobot_uca.policies.processor_base import make_processors
-from lerobot_uca.policies.processor_hand_frame import HandFrameProcessorStep
+from lerobot_uca.policies.processor_hand_frame import HandFrameProcessorStep, hand_frame_steps
 
 MEAN = [0.1, 0.6, 0.2]
 
@@ -129,6 +129,12 @@ def test_without_the_mean_it_cannot_be():
         del stats["observation.state"][name]
     with pytest.raises(UserError, match=r"policy\.hand_position needs 'mean' of 'observation\.state'"):
         make_processors(make_config(hand_position=(0, 1, 2)), stats)
+
+
+@pytest.mark.parametrize("wrong", [[0.1, 0.6], [float("nan")] * N_STATES])
+def test_a_wrong_mean(wrong):
+    with pytest.raises(UserError, match=f"as {N_STATES} finite numbers"):
+        hand_frame_steps(make_config(hand_position=(0, 1, 2)), {"mean": wrong})
 
 
 def test_without_observations_nothing_happens():

@@ -39,7 +39,12 @@ def hand_frame_steps(config: PointCloudPolicyConfig, state_statistics: Mapping[s
             "makes it."
         )
     dimensions = list(config.hand_position)
-    mean = np.asarray(state_statistics["mean"], dtype=np.float64)[dimensions]
+    values = np.asarray(state_statistics["mean"], dtype=np.float64)
+    if values.shape != (config.n_states,) or not np.isfinite(values).all():
+        raise UserError(
+            f"policy.hand_position needs 'mean' of '{OBS_STATE}' as {config.n_states} finite numbers, got {values}."
+        )
+    mean = values[dimensions]
     return [HandFrameProcessorStep(dimensions, mean.tolist())]
 
 
