@@ -4,6 +4,7 @@ python benchmarks/grasps.py outputs/train/checkpoints/last/pretrained_model shel
 
 One line an episode, then for x and y how far the hand's place follows the thing's: the slope of a straight line through
 all episodes, 1 for a hand that is always at the thing, 0 for one that closes at the same place wherever the thing is.
+A hand is closed where it stays 1 cm less open than at the start for five steps; episodes in which it never is are left out.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.run_cell import load_lerobot, make_env
 
 FIRST_SEED = 5_000_000  # no table's episodes
+N_STEPS = 5
 
 
 def main() -> None:
@@ -47,14 +49,18 @@ def main() -> None:
     hands, things, successes = [], [], []
     for episode in run_episodes(make, plan.config, plan, seeds, n_envs=1, watch=watch):
         widths = np.array([width for _, _, width in frames])
-        hand, thing, _ = frames[int(np.argmax(widths < widths[:5].max() - 0.01))]  # 1 cm less open than at the start
+        successes.append(episode.success)
+        verdict = f"{episode.seed} {'success' if episode.success else 'failure'}"
+        closed = np.convolve(widths < widths[:N_STEPS].max() - 0.01, np.ones(N_STEPS), mode="valid") == N_STEPS
+        if not closed.any():
+            print(f"{verdict}: hand does not close")
+            continue
+        hand, thing, _ = frames[int(closed.argmax())]
         hands.append(hand)
         things.append(thing)
-        successes.append(episode.success)
         dx, dy, _ = 1e3 * (hand - thing)
         x, y, _ = thing
-        print(f"{episode.seed} {'success' if episode.success else 'failure'}: thing at {x:.3f} {y:.3f} m, ", end="")
-        print(f"hand closes {dx:+.0f} {dy:+.0f} mm from it")
+        print(f"{verdict}: thing at {x:.3f} {y:.3f} m, hand closes {dx:+.0f} {dy:+.0f} mm from it")
     print(f"success: {sum(successes)} of {len(successes)}")
     for axis, name in enumerate("xy"):
         hand, thing = (np.array(places)[:, axis] for places in (hands, things))

@@ -75,7 +75,7 @@ class HandFrameProcessorStep(ProcessorStep):
 
     def seen_from_hand(self, cloud: Tensor, state: Tensor) -> Tensor:
         """Clouds (..., N, C), xyz first [m], of states (..., S)."""
-        if state.shape[-1] <= max(self.dimensions):  # the policy says which shape it needs
+        if state.ndim + 1 != cloud.ndim or state.shape[-1] <= max(self.dimensions):  # the policy says what it needs
             return cloud
         motion = state.new_tensor(self.mean) - state[..., self.dimensions]
         xyz = cloud[..., :3] + motion.unsqueeze(-2)
