@@ -4,7 +4,7 @@ python benchmarks/grasps.py outputs/train/checkpoints/last/pretrained_model shel
 
 One line an episode, then for x and y how far the hand's place follows the thing's: the slope of a straight line through
 all episodes, 1 for a hand that is always at the thing, 0 for one that closes at the same place wherever the thing is.
-A hand is closed where it stays 1 cm less open than at the start for five steps; episodes in which it never is are left out.
+A hand is closed where it stays 1 cm less open than at the start for five steps; the slopes leave out episodes without.
 """
 
 import argparse

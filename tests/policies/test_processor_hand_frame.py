@@ -142,7 +142,6 @@ def test_without_observations_nothing_happens():
     transition = {TransitionKey.ACTION: torch.zeros(1, 4), TransitionKey.OBSERVATION: {}}
     assert step(transition) is transition
     observation = make_observation()
-    for wrong in (torch.zeros(1, 2), torch.zeros(7, 5, 9)):  # the policy says what it needs
-        given = {OBS_POINT_CLOUD: observation[OBS_POINT_CLOUD], "observation.state": wrong}
-        after = step({TransitionKey.OBSERVATION: given})[TransitionKey.OBSERVATION]
-        torch.testing.assert_close(after[OBS_POINT_CLOUD], given[OBS_POINT_CLOUD])
+    short = {OBS_POINT_CLOUD: observation[OBS_POINT_CLOUD], "observation.state": torch.zeros(1, 2)}
+    after = step({TransitionKey.OBSERVATION: short})[TransitionKey.OBSERVATION]
+    torch.testing.assert_close(after[OBS_POINT_CLOUD], short[OBS_POINT_CLOUD])

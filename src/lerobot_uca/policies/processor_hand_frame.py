@@ -74,8 +74,8 @@ class HandFrameProcessorStep(ProcessorStep):
         return {**transition, TransitionKey.OBSERVATION: {**observation, OBS_POINT_CLOUD: moved}}
 
     def seen_from_hand(self, cloud: Tensor, state: Tensor) -> Tensor:
-        """Clouds (..., N, C), xyz first [m], of states (..., S)."""
-        if state.ndim + 1 != cloud.ndim or state.shape[-1] <= max(self.dimensions):  # the policy says what it needs
+        """Clouds (..., N, C), xyz first [m], of states (..., S), or of one state (S,), which gets its batch later."""
+        if state.shape[-1] <= max(self.dimensions):  # the policy says which shape it needs
             return cloud
         motion = state.new_tensor(self.mean) - state[..., self.dimensions]
         xyz = cloud[..., :3] + motion.unsqueeze(-2)
