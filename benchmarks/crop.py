@@ -17,7 +17,7 @@ from common import print_provenance
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from lerobot_uca.envs.metaworld import CLOUD_CAMERA, MetaworldPointCloudEnv, ScriptedExpert, task_descriptions
+from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv, ScriptedExpert, camera_of, drawn_goal, task_descriptions
 from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.ray_casting import RayCaster
 
@@ -45,13 +45,14 @@ def worst_shares(task: str, n_seeds: int) -> tuple[float, float]:
     env = MetaworldPointCloudEnv(task)
     low = np.array(env.crop.low) - [0, 0, TABLE_SLACK]
     around_origins = Crop(tuple(low), env.crop.high)
-    caster = RayCaster(CLOUD_CAMERA)
+    caster = RayCaster(camera_of(task))
     positions, points = [], []
     for seed in range(n_seeds):
         env.reset(seed=seed)
         simulator = env._simulator
         objects = np.array(simulator._get_pos_objects()).reshape(-1, 3)
-        positions.append(around_origins.contains(np.concatenate([objects, [simulator._target_pos]])).mean())
+        goal = drawn_goal(task, simulator._target_pos)
+        positions.append(around_origins.contains(np.concatenate([objects, [goal]])).mean())
         hits = caster.cast(simulator.model, simulator.data)
         movable = is_movable(simulator.model)[simulator.model.geom_bodyid[hits.geom]] & (hits.geom >= 0)
         if movable.any():

@@ -10,6 +10,8 @@ from lerobot_uca.envs.metaworld import (
     CLOUD_CAMERA,
     MetaworldPointCloudEnv,
     ScriptedExpert,
+    camera_of,
+    drawn_goal,
     task_descriptions,
     task_groups,
 )
@@ -85,7 +87,7 @@ def test_rendering_needs_no_opengl(env, monkeypatch):
 
 
 @pytest.mark.parametrize("task", sorted(task_descriptions()))
-def test_objects_and_goals_lie_inside_the_crop(task):
+def test_objects_and_goals_lie_inside_the_crop_and_the_picture(task):
     """Two seeds a task; benchmarks/crop.py checks fifty."""
     env = MetaworldPointCloudEnv(task, n_points=16)
     low, high = np.array(env.crop.low), np.array(env.crop.high)
@@ -94,8 +96,14 @@ def test_objects_and_goals_lie_inside_the_crop(task):
         env.reset(seed=seed)
         simulator = env._simulator
         positions = np.array(simulator._get_pos_objects()).reshape(-1, 3)
-        positions = np.concatenate([positions, [simulator._target_pos]])
+        goal = drawn_goal(task, simulator._target_pos)
+        positions = np.concatenate([positions, [goal]])
         assert Crop(tuple(low), tuple(high)).contains(positions).all(), positions
+        camera = camera_of(task)
+        x, y, z, _ = np.linalg.inv(camera.X_world_camera) @ [*goal, 1]
+        column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        assert 0 < column < camera.width - 1
+        assert 0 < row < camera.height - 1
 
 
 def test_goals_that_nothing_else_shows_are_in_the_cloud():
@@ -103,6 +111,52 @@ def test_goals_that_nothing_else_shows_are_in_the_cloud():
     observation, _ = env.reset(seed=3)
     distance = np.linalg.norm(observation["point_cloud"] - env._simulator._target_pos, axis=1)
     assert (np.abs(distance - 0.02) < 1e-4).sum() >= 3
+
+
+def test_hand_inserts_cloud_shows_block_and_goal_and_not_the_table():
+    env = MetaworldPointCloudEnv("hand-insert", n_points=128)
+    for seed in range(3):
+        cloud = env.reset(seed=seed)[0]["point_cloud"]
+        block, goal = env._simulator._get_pos_objects()[:3], drawn_goal(env.task, env._simulator._target_pos)
+        assert (np.abs(cloud - block) < 0.03).all(axis=1).sum() >= 5  # 1 with the table
+        assert (np.abs(np.linalg.norm(cloud - goal, axis=1) - 0.02) < 1e-4).sum() >= 1
+        assert cloud[:, 2].min() > 0.05
+
+
+@pytest.mark.parametrize("task", metaworld.HIGH_TASKS)
+def test_the_high_camera_is_the_baselines_with_more_above_and_below(task):
+    low, high = CLOUD_CAMERA, camera_of(task)
+    assert low.X_world_camera == high.X_world_camera
+    assert high.fx == pytest.approx(low.fx, rel=2e-3)
+    assert (high.width, high.fx) == pytest.approx((low.width, high.fy))
+    assert low.height < high.height
+
+
+@pytest.mark.parametrize("task", ["box-close", "disassemble", "peg-unplug-side", "stick-pull"])
+def test_an_episode_begins_with_things_upright_and_still(task):
+    """Seeds that Meta-World's own reset leaves turned by up to 143 degrees, or moving."""
+    env = MetaworldPointCloudEnv(task, n_points=16)
+    for seed in range(5_000_004, 5_000_010):
+        env.reset(seed=seed)
+        model, data = env._simulator.model, env._simulator.data
+        assert not any(
+            data.joint(joint).qvel.any()
+            for joint in range(model.njnt)
+            if not model.joint(joint).name.startswith(metaworld.ARM_JOINTS)
+        )
+        for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+            turn = slice(model.jnt_qposadr[joint] + 3, model.jnt_qposadr[joint] + 7)
+            np.testing.assert_array_equal(data.qpos[turn], model.qpos0[turn])
+        # What the expert sees is where things are.
+        np.testing.assert_array_equal(env.expert_observation[4:7], env._simulator._get_pos_objects()[:3])
+        np.testing.assert_array_equal(env.expert_observation[18:36], env.expert_observation[:18])
+
+
+def test_the_arms_joints_go_by_these_names():
+    for task in task_descriptions():
+        model = metaworld._make_simulator(task).model
+        names = [model.joint(joint).name for joint in range(model.njnt)]
+        assert sum(name.startswith(metaworld.ARM_JOINTS) for name in names) == 9, (task, names)
 
 
 def test_the_papers_tasks_have_its_counts():

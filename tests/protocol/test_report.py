@@ -16,7 +16,7 @@ from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, Cell
 from lerobot_uca.protocol.command import main
 from lerobot_uca.protocol.figures import COLOURS
 from lerobot_uca.protocol.folder import RunFolder, write_json
-from lerobot_uca.protocol.paper import ABLATION, COLUMNS, MILLISECONDS, SUCCESS
+from lerobot_uca.protocol.paper import ABLATION, COLUMNS, MILLISECONDS, SUCCESS, goal
 from lerobot_uca.protocol.results import Results
 from lerobot_uca.protocol.rows import Row, write_rows
 from lerobot_uca.protocol.setting import Setting
@@ -47,6 +47,7 @@ def add_cell(folder, cell, n_final, interim=(0, 20, 20, 20, 20, 10)):
     record = {
         "cell": cell._asdict(),
         "inference": {"median_ms": 2.0 + cell.seed},
+        "minutes": {"training": 6.0, "evaluation": 1.0},
         "hardware": {"cpu": "a CPU", "gpu": None, "cores": 2, "threads": 1},
     }
     write_json(files.result, record)
@@ -170,6 +171,25 @@ def test_with_less_than_five_evaluations_the_papers_rule_has_no_number(tmp_path)
     assert results.papers_rule([REACH], "uca_flow") is None
 
 
+@pytest.mark.parametrize(
+    ("interim", "minutes"),
+    [((0, 18, 19, 20, 20, 20), 3.0), ((19, 0, 0, 0, 0, 0), 1.0), ((18, 18, 18, 18, 18, 18), None)],
+)
+def test_minutes_until_the_papers_success(tmp_path, interim, minutes):
+    """Six minutes of training, an evaluation each minute; 19 of 20 are the first that are at least 92.4 %."""
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    cell = Cell(REACH, "uca_flow", 0)
+    add_cell(folder, cell, 50, interim)
+    results, _ = Results.read([folder.path])
+    assert results.minutes_until(cell, goal(REACH).mean / 100) == minutes
+
+
+def test_goals():
+    """Printed for the task, for its group, and not at all."""
+    goals = {"metaworld/shelf-place": 74.0, "metaworld/reach": 92.4, "adroit/pen": 63.0, "metaworld/basketball": None}
+    assert {task: getattr(goal(task), "mean", None) for task in goals} == goals
+
+
 def test_differences_are_paired(folder, tmp_path):
     """Both have only seed 0's episodes on reach: 80 and 60 of the same 100."""
     main(["report", str(folder.path), f"--output={tmp_path}/report"])
@@ -215,11 +235,11 @@ def test_the_page_is_self_contained(folder, tmp_path):
     page = Page()
     page.feed(text)
     assert page.open == []
-    assert page.n_svg == 3
+    assert page.n_svg == 4
     assert all(reference.startswith("#") for reference in page.references)
     assert len(set(page.ids)) == len(page.ids)
     assert "<script" not in text
-    for png in ("success_over_epochs", "success_and_latency", "success_by_task"):
+    for png in ("success_over_epochs", "success_and_latency", "success_by_task", "minutes_to_success"):
         assert (tmp_path / "report" / f"{png}.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -175,7 +175,7 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
 
     @override
     def view(self, task: str) -> tuple[Camera, Crop]:
-        return metaworld.CLOUD_CAMERA, metaworld.crop_of(task)
+        return metaworld.camera_of(task), metaworld.crop_of(task)
 
     @override
     def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:

@@ -111,8 +111,6 @@ def success_and_latency(results: Results, plt: Any) -> Any:
 
 def bars(results: Results, plt: Any) -> Any:
     """Success on each task with its interval; a line where the paper prints a number."""
-    from lerobot_uca.protocol.tables import of_task
-
     tasks = [task for task in results.tasks if any(results.seeds(task, policy) for policy in results.policies)]
     if not tasks:
         return None
@@ -121,7 +119,7 @@ def bars(results: Results, plt: Any) -> Any:
     figure, axis = plt.subplots(figsize=size, layout="constrained")
     for index, policy in enumerate(results.policies):
         for row, task in enumerate(tasks):
-            estimate, printed = results.honest((task,), policy), of_task(task, policy)
+            estimate, printed = results.honest((task,), policy), paper.of_task(task, policy)
             y = row + (index - (len(results.policies) - 1) / 2) * height
             if estimate:
                 mean, low, high = (100 * value for value in estimate)
@@ -138,10 +136,34 @@ def bars(results: Results, plt: Any) -> Any:
     return figure
 
 
+def minutes_to_success(results: Results, plt: Any) -> Any:
+    """The share of cells that have reached the paper's success, over minutes of training, a line a policy."""
+    figure, axis = plt.subplots(figsize=(5, 3.2))
+    for policy in results.policies:
+        goals = {cell: goal for cell in results.records if cell.policy == policy and (goal := paper.goal(cell.task))}
+        minutes = [results.minutes_until(cell, goal.mean / 100) for cell, goal in goals.items()]
+        reached = sorted(each for each in minutes if each is not None)
+        if goals:
+            longest = max(results.training_minutes(cell) for cell in goals)
+            shares = 100 * np.arange(len(reached) + 1) / len(goals)
+            label = f"{POLICIES[policy].title}, {len(reached)} of {len(goals)}"
+            axis.step([0, *reached, longest], [*shares, shares[-1]], where="post", color=COLOURS[policy], label=label)
+    if not axis.lines:
+        plt.close(figure)
+        return None
+    axis.set_ylim(0, 103)
+    axis.set_xlim(left=0)
+    axis.set_xlabel("minutes of training")
+    axis.set_ylabel("at the paper's success [%]")
+    axis.legend(loc="lower right")
+    return figure
+
+
 FIGURES: dict[str, Callable[[Results, Any], Any]] = {
     "success_over_epochs": curves,
     "success_and_latency": success_and_latency,
     "success_by_task": bars,
+    "minutes_to_success": minutes_to_success,
 }
 CAPTIONS = {
     "success_over_epochs": "Success in the evaluations during training; the band is from the lowest to the highest "
@@ -150,6 +172,10 @@ CAPTIONS = {
     "95 % interval, over the tasks that are there; hollow the paper's, over its 37 tasks.",
     "success_by_task": "Success of the last checkpoints in fresh episodes, with 95 % interval; the black line is the "
     "paper's number, where it prints one.",
+    "minutes_to_success": "How many trainings (a task and a seed) have been, in an evaluation on the way, as "
+    "successful as the paper's UCA-Flow on the task, or on the task's group where no more is "
+    "printed, after so many minutes. An evaluation has few episodes, so some reach it by luck, "
+    "and earlier than they hold it.",
     "rollouts": "An evaluation episode of each policy, from its start to its end: the first that ended as most did.",
 }
 """What a figure shows, by its file's name."""

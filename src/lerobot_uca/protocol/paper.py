@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from lerobot_uca.protocol.cells import SUITES
+from lerobot_uca.protocol.cells import PAPER_GROUPS, SUITES
 
 
 class Printed(NamedTuple):
@@ -80,3 +80,17 @@ ABLATION = {
     for policy, numbers in _ABLATION.items()
 }
 """Table 3: success [%] by task."""
+
+
+def of_task(task: str, policy: str) -> Printed | None:
+    """A policy's success [%] on one task, where the paper prints it."""
+    in_table_1 = SUCCESS.get(policy, {}).get(task.split("/")[1]) if task in PAPER_GROUPS["adroit"] else None
+    return ABLATION.get(policy, {}).get(task) or in_table_1
+
+
+def goal(task: str) -> Printed | None:
+    """UCA-Flow's success [%] on a task, or on the task's group where no more is printed; None outside the 37 tasks."""
+    for group, tasks in PAPER_GROUPS.items():
+        if task in tasks:
+            return of_task(task, "uca_flow") or SUCCESS["uca_flow"][group]
+    return None

@@ -147,6 +147,20 @@ class Results:
                     by_epoch[self._epochs[task, step]].append(float(np.mean(successes)))
         return dict(sorted(by_epoch.items()))
 
+    # Training time. ---------------------------------------------------------------------------------------------
+
+    def training_minutes(self, cell: Cell) -> float:
+        """Minutes that a finished cell's training took."""
+        return float(self.records[cell]["minutes"]["training"])
+
+    def minutes_until(self, cell: Cell, success: float) -> float | None:
+        """Minutes of training, its steps equally long, before a finished cell's first evaluation with this success."""
+        n_steps = self.setting.length(cell).steps
+        for step, successes in sorted(self._interim[cell].items()):
+            if np.mean(successes) >= success:
+                return self.training_minutes(cell) * step / n_steps
+        return None
+
     # Inference. -------------------------------------------------------------------------------------------------
 
     def milliseconds(self, tasks: Sequence[str], policy: str) -> tuple[float, float] | None:

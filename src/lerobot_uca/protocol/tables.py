@@ -189,17 +189,11 @@ def task_table(results: Results) -> Table:
             rule = results.papers_rule((task,), policy)
             seeds = results.seeds(task, policy)
             if honest or rule:
-                printed = of_task(task, policy)
+                printed = paper.of_task(task, policy)
                 names = ", ".join(map(str, seeds))
                 rows.append([task, policy, names, _printed(printed), _spread(rule, 100), _interval(honest)])
     header = ["task", "policy", "seeds", "paper", "ours, paper's rule", "ours, honest"]
     return Table("tasks", "Every task: success [%]", setting_of(results), header, rows)
-
-
-def of_task(task: str, policy: str) -> paper.Printed | None:
-    """The paper's number for one task, where it prints one."""
-    in_table_1 = paper.SUCCESS.get(policy, {}).get(task.split("/")[1]) if task in PAPER_GROUPS["adroit"] else None
-    return paper.ABLATION.get(policy, {}).get(task) or in_table_1
 
 
 TABLES: tuple[Callable[[Results], Table], ...] = (
