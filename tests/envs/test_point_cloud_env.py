@@ -94,7 +94,12 @@ def depth_config(kind: str, task: str):
 
 @pytest.mark.parametrize(
     ("kind", "task"),
-    [("metaworld_pointcloud", "drawer-close"), ("metaworld_pointcloud", "hand-insert"), ("adroit_pointcloud", "door")],
+    [
+        ("metaworld_pointcloud", "drawer-close"),
+        ("metaworld_pointcloud", "pick-out-of-hole"),
+        ("metaworld_pointcloud", "stick-pull"),
+        ("adroit_pointcloud", "door"),
+    ],
 )
 def test_a_depth_image_gives_the_cloud_that_the_environment_gives(kind, task):
     """Points are where the cloud's are, to half a millimetre of depth; which of them are sampled may differ."""
