@@ -111,6 +111,8 @@ def resolve(spec: str | None) -> dict[str, tuple[str, ...]]:
 class MetaworldPointCloudEnv(PointCloudEnv):
     """One Meta-World task, observed as the baselines observe it: a point cloud and the gripper's position.
 
+    Where starts, crops and three tasks' pictures differ from theirs stands in docs/differences.md.
+
     `agent_pos` (9,) [m, world frame]: positions of the hand, the right and the left finger.
     Action (4,): a motion of the hand by up to 1 cm along x, y and z, and the gripper's effort.
     An episode terminates at the first success and is truncated after 200 steps. Stepping past a success is allowed
@@ -206,18 +208,16 @@ def _put_at_rest(simulator: Any) -> None:
 
     It resets twice, the second time with the model as the first has edited it, where things may collide while the hand
     finds its place, and then sets positions: a ring stays turned by up to 143 degrees (disassemble, 7 of 25 starts), a
-    plug keeps turning, and the thermos slides by 20 cm because its velocity is addressed by its position's index.
+    plug keeps turning, and the thermos slides by 19 cm because its velocity is addressed by its position's index.
     """
     model, data = simulator.model, simulator.data
-    for joint in range(model.njnt):
-        if model.joint(joint).name.startswith(ARM_JOINTS):
+    for joint in map(model.joint, range(model.njnt)):
+        if joint.name.startswith(ARM_JOINTS):
             continue
-        position, velocity = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            data.qpos[position + 3 : position + 7] = model.qpos0[position + 3 : position + 7]
-            data.qvel[velocity : velocity + 6] = 0
-        else:
-            data.qvel[velocity] = 0
+        state = data.joint(joint.id)
+        state.qvel[:] = 0
+        if joint.type == mujoco.mjtJoint.mjJNT_FREE:
+            state.qpos[3:] = joint.qpos0[3:]  # its quaternion
     # Meta-World moves bodies by editing the model and leaves the poses in the data behind.
     mujoco.mj_forward(model, data)
     simulator._prev_obs = simulator._get_curr_obs_combined_no_goal()  # the expert sees no motion either
