@@ -18,6 +18,7 @@ from lerobot_uca.data.collect import CollectConfig, collect
 from lerobot_uca.data.demonstrations import Demonstration, demonstrate
 from lerobot_uca.envs.adroit import HAND
 from lerobot_uca.envs.configs import AdroitPointCloudConfig, MetaworldPointCloudConfig
+from lerobot_uca.envs.experts.expert import pushed
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe
@@ -47,6 +48,25 @@ def test_a_dataset_holds_whole_episodes_as_executed(collected):
     assert np.abs(episode.action).max() == 1  # the expert asks for more; what is written is what was done
     assert episode.is_successful
     assert frames[0]["task"] == env.task_description("drawer-close")
+
+
+def test_of_a_pushed_hand_the_dataset_holds_what_the_expert_would_have_done(tmp_path):
+    env_config = collected_env()
+    collect(config(tmp_path / "drawer", pushes=0.05))
+    dataset = LeRobotDataset("test/drawer", root=tmp_path / "drawer")
+    attempts = env_config.attempts("drawer-close", None, collecting.FIRST_SEED)
+    attempt = next(pushed(attempts, 0.05, ["x", "y", "z", "gripper"]))
+    env, (expert, executed) = env_config.env_factory("drawer-close")(), attempt.actors()
+    observation, _ = env.reset(**attempt.reset)
+    n_pushed = 0
+    for frame in dataset:
+        np.testing.assert_array_equal(frame["observation.state"], observation["agent_pos"])
+        action = expert(env)
+        np.testing.assert_array_equal(frame["action"], action)
+        done = executed(action)
+        n_pushed += not np.array_equal(done, action)
+        observation, *_ = env.step(done)
+    assert 10 < n_pushed < 100
 
 
 def collected_env():

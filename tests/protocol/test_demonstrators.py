@@ -3,7 +3,7 @@ import csv
 import numpy as np
 import pytest
 
-from lerobot_uca.envs.experts.expert import Attempt, Smoothed, smoothed
+from lerobot_uca.envs.experts.expert import Attempt, Pushes, Smoothed, pushed, smoothed
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.command import main
@@ -31,13 +31,57 @@ def test_wrong_smoothing(smoothing):
         smoothed(iter([]), smoothing)
 
 
+def test_a_push_takes_the_hand_for_some_steps_and_leaves_the_gripper():
+    pushes = Pushes([0, 1, 2], 0.1, seed=3)
+    wanted = np.random.default_rng(0).uniform(-1, 1, (4000, 4)).astype(np.float32)
+    executed = np.stack([pushes(action) for action in wanted])
+    is_pushed = (executed != wanted).any(axis=1)
+    np.testing.assert_array_equal(executed[:, 3], wanted[:, 3])
+    directions, lengths = np.unique(executed[is_pushed, :3], axis=0, return_counts=True)
+    assert abs(directions).max() <= 1
+    assert set(lengths) == {5, 6, 7, 8, 9, 10}  # one motion in each
+    n_free = len(wanted) - is_pushed.sum()
+    assert len(lengths) == pytest.approx(0.1 * n_free, rel=0.2)  # of the steps without one
+
+
+def test_a_seed_decides_the_pushes():
+    action = np.zeros(4, np.float32)
+
+    def of(seed):
+        pushes = Pushes([0, 1, 2], 0.2, seed)
+        return np.stack([pushes(action) for _ in range(100)])
+
+    np.testing.assert_array_equal(of(1), of(1))
+    assert not np.array_equal(of(1), of(2))
+
+
+def test_without_probability_nothing_is_pushed():
+    attempts = iter([Attempt({"seed": 1}, steps_of([1, 0]))])
+    assert pushed(attempts, 0, ["x"]) is attempts
+    _, executed = next(attempts).actors()
+    action = np.ones(1, np.float32)
+    assert executed(action) is action
+
+
+@pytest.mark.parametrize("probability", [-0.1, 1, float("nan")])
+def test_wrong_pushes(probability):
+    with pytest.raises(UserError, match="--pushes must be at least 0"):
+        pushed(iter([]), probability, ["x", "y", "z"])
+
+
+def test_pushes_need_a_hand_that_actions_move():
+    with pytest.raises(UserError, match=r"named x, y and z as Meta-World's; these are WRJ1, WRJ0\."):
+        pushed(iter([]), 0.1, ["WRJ1", "WRJ0"])
+
+
 def test_a_table_of_experts(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(MetaworldPointCloudEnv, "observe", None)  # nobody looks
     path = tmp_path / "table.csv"
-    main(["demonstrators", "--tasks=drawer-close", "--episodes=2", f"--output={path}"])
+    main(["demonstrators", "--tasks=drawer-close", "--episodes=2", "--pushes=0.01", f"--output={path}"])
     with path.open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["task"], row["episodes"], row["demonstrations"]) == ("metaworld/drawer-close", "2", "2")
+    assert row["pushes"] == "0.01"
     assert 0 < float(row["roughness"]) < 1
     assert "metaworld/drawer-close: 2 of 2 (any success: 2)" in capsys.readouterr().out
 

@@ -26,7 +26,7 @@ from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.data.demonstrations import demonstrations
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
-from lerobot_uca.envs.experts.expert import Attempt, smoothed
+from lerobot_uca.envs.experts.expert import Attempt, pushed, smoothed
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.hub import push_dataset
@@ -60,6 +60,10 @@ class CollectConfig:
     # Weight of the expert's new action against the last one, a first-order filter: 1 for the expert as it is. An expert
     # that chatters is easier to imitate when it is smoothed, and may even succeed more often (docs/benchmark.md).
     smoothing: float = 1.0
+    # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction. The
+    # dataset holds what the expert would have done, also on its way back: from as many demonstrations a policy learns
+    # far more (docs/benchmark.md). 0 for the expert undisturbed, as in the papers.
+    pushes: float = 0.0
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)
     # Seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of
@@ -103,7 +107,11 @@ def collect(config: CollectConfig) -> LeRobotDataset:
 def _attempts(config: CollectConfig, env_config: PointCloudEnvConfig) -> dict[str, Iterator[Attempt]]:
     # Groups may overlap; a task's episodes are wanted once.
     tasks = dict.fromkeys(task for tasks in env_config.tasks().values() for task in tasks)
-    return {task: smoothed(env_config.attempts(task, config.expert, config.seed), config.smoothing) for task in tasks}
+    attempts = {task: env_config.attempts(task, config.expert, config.seed) for task in tasks}
+    names = env_config.action_names()
+    return {
+        task: pushed(smoothed(of_task, config.smoothing), config.pushes, names) for task, of_task in attempts.items()
+    }
 
 
 def _write(

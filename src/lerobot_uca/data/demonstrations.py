@@ -20,13 +20,14 @@ class Demonstration(NamedTuple):
 
     seen: NDArray[Any]  # (L, N, 3) point clouds or (L, 1, H, W) depth images
     state: NDArray[np.float32]  # (L, S)
-    action: NDArray[np.float32]  # (L, A), as executed
+    action: NDArray[np.float32]  # (L, A), the expert's
     is_successful: bool
 
 
 def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> Demonstration:
     """Run an expert for a whole episode, also past its first success."""
-    env, expert = env_factory(), attempt.expert()
+    env = env_factory()
+    expert, executed = attempt.actors()
     observation, _ = env.reset(**attempt.reset)
     steps: list[tuple[Any, ...]] = []
     n_successful = 0
@@ -34,7 +35,7 @@ def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> D
     while not is_over:
         action = expert(env)
         steps.append((observation[env.observer.key], observation["agent_pos"], action))
-        observation, _, terminated, truncated, info = env.step(action)
+        observation, _, terminated, truncated, info = env.step(executed(action))
         n_successful += info["is_success"]
         is_over = truncated or (terminated and not info["is_success"])
     env.close()

@@ -126,6 +126,7 @@ How often each task's expert succeeds, and how much its actions change from step
 
   lerobot-uca-benchmark demonstrators --suite=paper --expert='experts/{task}.npz' --output=demonstrators.csv
   lerobot-uca-benchmark demonstrators --tasks=pen --expert='experts/{task}.npz' --smoothing=0.3 --output=smooth.csv
+  lerobot-uca-benchmark demonstrators --tasks=very_hard --pushes=0.025 --output=pushed.csv
 """
 
 
@@ -142,6 +143,7 @@ def _add_demonstrators(commands: "argparse._SubParsersAction[argparse.ArgumentPa
     parser.add_argument("--tasks", help="tasks or groups out of the suite, separated by commas (default: all)")
     parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
     parser.add_argument("--smoothing", type=float, default=1.0, help="as for lerobot-uca-collect (default: 1)")
+    parser.add_argument("--pushes", type=float, default=0.0, help="as for lerobot-uca-collect (default: 0)")
     parser.add_argument("--episodes", type=int, default=50, help="of each task (default: 50)")
     parser.set_defaults(do=_demonstrators)
 
@@ -152,6 +154,6 @@ def _demonstrators(args: argparse.Namespace) -> None:
     if args.episodes < 1:
         raise UserError(f"--episodes must be at least 1, got {args.episodes}.")
     tasks = resolve_tasks(args.suite, args.tasks)
-    options = {"expert": args.expert, "smoothing": args.smoothing, "n_episodes": args.episodes}
-    for row in demonstrators(tasks, args.output, **options):
+    disturbed = {"smoothing": args.smoothing, "pushes": args.pushes}
+    for row in demonstrators(tasks, args.output, expert=args.expert, n_episodes=args.episodes, **disturbed):
         print(f"{row.task}: {row.demonstrations} of {row.episodes} (any success: {row.any_success})")

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from lerobot_uca.data.collect import FIRST_SEED
 from lerobot_uca.envs.configs import PointCloudEnvConfig
-from lerobot_uca.envs.experts.expert import Attempt, smoothed
+from lerobot_uca.envs.experts.expert import Attempt, pushed, smoothed
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.processes import worker_pool
@@ -38,6 +38,7 @@ class Demonstrator(NamedTuple):
 
     task: str
     smoothing: float
+    pushes: float
     episodes: int
     demonstrations: int
     """Episodes that are kept as demonstrations: with as many successful steps as the benchmark's rule asks for."""
@@ -51,7 +52,7 @@ class Demonstrator(NamedTuple):
 
 
 def demonstrators(
-    tasks: Sequence[str], path: Path, *, expert: str | None, smoothing: float, n_episodes: int
+    tasks: Sequence[str], path: Path, *, expert: str | None, smoothing: float, pushes: float, n_episodes: int
 ) -> list[Demonstrator]:
     """Write a table of experts as CSV, task by task, so that what is there stays when it is stopped.
 
@@ -63,13 +64,14 @@ def demonstrators(
     path.parent.mkdir(parents=True, exist_ok=True)
     rows: list[Demonstrator] = []
     for task in tqdm(tasks, desc="Experts", unit="task"):
-        make_env, attempts, needed = _of_task(task, expert, smoothing)
+        make_env, attempts, needed = _of_task(task, expert, smoothing, pushes)
         trials = list(_trials(make_env, islice(attempts, n_episodes)))
         kept = [trial for trial in trials if trial.n_successful >= needed]
         rows.append(
             Demonstrator(
                 task=task,
                 smoothing=smoothing,
+                pushes=pushes,
                 episodes=len(trials),
                 demonstrations=len(kept),
                 any_success=sum(trial.n_successful > 0 for trial in trials),
@@ -84,12 +86,13 @@ def demonstrators(
 
 def try_once(make_env: Callable[[], PointCloudEnv], attempt: Attempt) -> Trial:
     """Run an expert for a whole episode, also past its first success, as it is demonstrated."""
-    env, expert = make_env(), attempt.expert()
+    env = make_env()
+    expert, executed = attempt.actors()
     env.reset(**attempt.reset)
     actions, n_successful, is_over = [], 0, False
     while not is_over:
         actions.append(expert(env))
-        _, terminated, truncated, info = env.act(actions[-1])
+        _, terminated, truncated, info = env.act(executed(actions[-1]))
         n_successful += bool(info["is_success"])
         is_over = truncated or (terminated and not info["is_success"])
     env.close()
@@ -103,12 +106,13 @@ def _trials(make_env: Callable[[], PointCloudEnv], attempts: Iterator[Attempt]) 
             yield future.result()
 
 
-def _of_task(task: str, expert: str | None, smoothing: float) -> tuple[Any, Iterator[Attempt], int]:
+def _of_task(task: str, expert: str | None, smoothing: float, pushes: float) -> tuple[Any, Iterator[Attempt], int]:
     cell = Cell(task, "uca_flow", 0)
     config = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
     assert isinstance(config, PointCloudEnvConfig)
     source = expert if cell.benchmark == "adroit" else None
     attempts = smoothed(config.attempts(cell.env_task, source, FIRST_SEED), smoothing)
+    attempts = pushed(attempts, pushes, config.action_names())
     make_env = config.env_factory(cell.env_task)
     return make_env, attempts, make_env().min_successful_steps
 

@@ -48,6 +48,8 @@ class Setting:
     """Expert episodes of a task."""
     smoothing: Mapping[str, float] = field(default_factory=dict)
     """The smoothing of experts' actions by task, as for lerobot-uca-collect."""
+    pushes: Mapping[str, float] = field(default_factory=dict)
+    """The probability of pushes by benchmark, as for lerobot-uca-collect."""
     interim_episodes: int = 20
     """Episodes of each evaluation during training."""
     final_episodes: int = 100
@@ -103,12 +105,7 @@ class Setting:
                     f"Setting '{self.name}': steps of {key} must be a multiple of its evaluations, "
                     f"got {length.steps} and {length.evaluations}."
                 )
-        for task, smoothing in self.smoothing.items():
-            if task not in SUITES["all"] or not isinstance(smoothing, int | float) or not 0 < smoothing <= 1:
-                raise UserError(
-                    f"Setting '{self.name}': smoothing holds numbers above 0 and up to 1 by 'benchmark/task', "
-                    f"got {task}: {smoothing!r}."
-                )
+        self._check_demonstrators()
         types = sorted({method.type for method in POLICIES.values()})
         for field_name, what, valid in (("benchmarks", "benchmark", list(ENVIRONMENTS)), ("policies", "type", types)):
             for name in getattr(self, field_name):
@@ -117,6 +114,20 @@ class Setting:
                         f"Setting '{self.name}': {field_name} holds options by {what} ({', '.join(valid)}), "
                         f"got '{name}'."
                     )
+
+    def _check_demonstrators(self) -> None:
+        for task, smoothing in self.smoothing.items():
+            if task not in SUITES["all"] or not isinstance(smoothing, int | float) or not 0 < smoothing <= 1:
+                raise UserError(
+                    f"Setting '{self.name}': smoothing holds numbers above 0 and up to 1 by 'benchmark/task', "
+                    f"got {task}: {smoothing!r}."
+                )
+        for benchmark, probability in self.pushes.items():
+            if benchmark != "metaworld" or not isinstance(probability, int | float) or not 0 <= probability < 1:
+                raise UserError(
+                    f"Setting '{self.name}': pushes holds a number from 0 and below 1 by benchmark, metaworld alone, "
+                    f"got {benchmark}: {probability!r}."
+                )
 
     def as_values(self) -> dict[str, Any]:
         """The setting as plain values, for JSON."""

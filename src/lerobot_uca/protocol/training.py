@@ -40,6 +40,7 @@ def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
                 "root": dataset,
                 "n_episodes": folder.setting.demonstrations,
                 "smoothing": folder.setting.smoothing.get(cell.task, 1.0),
+                "pushes": folder.setting.pushes.get(cell.benchmark, 0.0),
             }
             if expert is not None and cell.benchmark == "adroit":
                 options["expert"] = expert

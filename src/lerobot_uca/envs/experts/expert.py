@@ -1,6 +1,6 @@
 """Demonstrators, and the starts of their episodes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import count
 from typing import Any, NamedTuple
@@ -20,6 +20,16 @@ class Attempt(NamedTuple):
     reset: dict[str, Any]
     """Arguments of the environment's `reset`."""
     expert: Callable[[], Expert]
+    pushes: "Callable[[], Pushes] | None" = None
+    """What else moves the hand, if anything does."""
+
+    def actors(self) -> tuple[Expert, Callable[[NDArray[np.float32]], NDArray[np.float32]]]:
+        """The expert, and what becomes of its actions: what the environment executes."""
+        return self.expert(), _as_it_is if self.pushes is None else self.pushes()
+
+
+def _as_it_is(action: NDArray[np.float32]) -> NDArray[np.float32]:
+    return action
 
 
 def attempts_by_seed(expert: Callable[[], Expert], first_seed: int) -> Iterator[Attempt]:
@@ -61,4 +71,64 @@ def smoothed(attempts: Iterator[Attempt], smoothing: float) -> Iterator[Attempt]
         raise UserError(f"--smoothing must be above 0 and at most 1 (which changes nothing), got {smoothing}.")
     if smoothing == 1:
         return attempts
-    return (Attempt(attempt.reset, partial(Smoothed, attempt.expert, smoothing)) for attempt in attempts)
+    return (attempt._replace(expert=partial(Smoothed, attempt.expert, smoothing)) for attempt in attempts)
+
+
+PUSH_STEPS = (5, 10)
+"""Fewest and most steps of a push."""
+
+
+class Pushes:
+    """Something that pushes the hand away now and then, so that the expert shows how it finds back.
+
+    A push is one random motion in [-1, 1] of each axis for 5 to 10 steps. What the expert would have done is recorded,
+    the push is executed: a policy errs, comes where an undisturbed expert never is, and must know what to do there.
+    DART (Laskey et al. 2017) adds noise to each action for the same reason; the experts here grasp too rarely with it.
+
+    Args:
+        axes: dimensions of the action that move the hand.
+        probability: that a push begins, in each step without one.
+        seed: of the pushes.
+    """
+
+    def __init__(self, axes: Sequence[int], probability: float, seed: int) -> None:
+        self._axes, self._probability = list(axes), probability
+        self._rng = np.random.default_rng([seed, 1])  # not the environment's numbers, which the seed alone gives
+        self._push: NDArray[np.float32] = np.zeros(len(axes), np.float32)
+        self._n_left = 0
+
+    def __call__(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The action to execute instead of the expert's (A,)."""
+        if self._n_left == 0 and self._rng.random() < self._probability:
+            self._n_left = int(self._rng.integers(*PUSH_STEPS, endpoint=True))
+            self._push = self._rng.uniform(-1, 1, len(self._axes)).astype(np.float32)
+        if self._n_left == 0:
+            return action
+        self._n_left -= 1
+        executed = action.copy()
+        executed[self._axes] = self._push
+        return executed
+
+
+def pushed(attempts: Iterator[Attempt], probability: float, action_names: Sequence[str]) -> Iterator[Attempt]:
+    """The same attempts with pushes, other ones in each episode.
+
+    Args:
+        attempts: by seed.
+        probability: that a push begins, in each step without one; 0 changes nothing.
+        action_names: of the environment; x, y and z are pushed.
+
+    Raises:
+        UserError: if the probability is not in [0, 1), or no action moves a hand.
+    """
+    if not 0 <= probability < 1:
+        raise UserError(f"--pushes must be at least 0 (which changes nothing) and below 1, got {probability}.")
+    if probability == 0:
+        return attempts
+    axes = [index for index, name in enumerate(action_names) if name in ("x", "y", "z")]
+    if not axes:
+        raise UserError(
+            f"--pushes={probability} needs actions that move the hand, named x, y and z as Meta-World's; these are "
+            f"{', '.join(action_names)}."
+        )
+    return (attempt._replace(pushes=partial(Pushes, axes, probability, attempt.reset["seed"])) for attempt in attempts)
