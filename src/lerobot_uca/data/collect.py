@@ -62,7 +62,7 @@ class CollectConfig:
     smoothing: float = 1.0
     # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction. The
     # dataset holds what the expert would have done, also on its way back: from as many demonstrations a policy learns
-    # far more (docs/benchmark.md). 0 for the expert undisturbed, as in the papers.
+    # far more (docs/results.md). 0 for the expert undisturbed, as in the papers.
     pushes: float = 0.0
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)
