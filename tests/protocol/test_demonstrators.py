@@ -31,24 +31,27 @@ def test_wrong_smoothing(smoothing):
         smoothed(iter([]), smoothing)
 
 
-def test_a_push_takes_the_hand_for_some_steps_and_leaves_the_gripper():
-    pushes = Pushes([0, 1, 2], 0.1, seed=3)
-    wanted = np.random.default_rng(0).uniform(-1, 1, (4000, 4)).astype(np.float32)
+def test_a_push_takes_the_hand_for_some_steps_and_sometimes_the_gripper():
+    pushes = Pushes([0, 1, 2], [3], 0.1, seed=3)
+    wanted = np.random.default_rng(0).uniform(-1, 1, (4000, 5)).astype(np.float32)
     executed = np.stack([pushes(action) for action in wanted])
     is_pushed = (executed != wanted).any(axis=1)
-    np.testing.assert_array_equal(executed[:, 3], wanted[:, 3])
-    directions, lengths = np.unique(executed[is_pushed, :3], axis=0, return_counts=True)
-    assert abs(directions).max() <= 1
+    np.testing.assert_array_equal(executed[:, 4], wanted[:, 4])  # what is neither
+    assert (executed[is_pushed, :3] != wanted[is_pushed, :3]).all()
+    _, first, lengths = np.unique(executed[is_pushed, :3], axis=0, return_index=True, return_counts=True)
+    assert abs(executed).max() <= 1
     assert set(lengths) == {5, 6, 7, 8, 9, 10}  # one motion in each
     n_free = len(wanted) - is_pushed.sum()
     assert len(lengths) == pytest.approx(0.1 * n_free, rel=0.2)  # of the steps without one
+    takes_gripper = executed[is_pushed, 3][first] != wanted[is_pushed, 3][first]
+    assert takes_gripper.mean() == pytest.approx(1 / 3, abs=0.1)
 
 
 def test_a_seed_decides_the_pushes():
     action = np.zeros(4, np.float32)
 
     def of(seed):
-        pushes = Pushes([0, 1, 2], 0.2, seed)
+        pushes = Pushes([0, 1, 2], [3], 0.2, seed)
         return np.stack([pushes(action) for _ in range(100)])
 
     np.testing.assert_array_equal(of(1), of(1))

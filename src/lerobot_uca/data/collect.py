@@ -60,9 +60,10 @@ class CollectConfig:
     # Weight of the expert's new action against the last one, a first-order filter: 1 for the expert as it is. An expert
     # that chatters is easier to imitate when it is smoothed, and may even succeed more often (docs/benchmark.md).
     smoothing: float = 1.0
-    # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction. The
-    # dataset holds what the expert would have done, also on its way back: from as many demonstrations a policy learns
-    # far more (docs/results.md). 0 for the expert undisturbed, as in the papers.
+    # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction, and in
+    # one of three pushes the gripper as well. The dataset holds what the expert would have done, also on its way back:
+    # from as many demonstrations a policy learns far more (docs/results.md). 0 leaves the expert undisturbed, as in the
+    # papers.
     pushes: float = 0.0
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)

@@ -76,37 +76,44 @@ def smoothed(attempts: Iterator[Attempt], smoothing: float) -> Iterator[Attempt]
 
 PUSH_STEPS = (5, 10)
 """Fewest and most steps of a push."""
+GRIPPER_SHARE = 1 / 3
+"""Of the pushes, those that take the gripper as well."""
 
 
 class Pushes:
     """Something that pushes the hand away now and then, so that the expert shows how it finds back.
 
-    A push is one random motion in [-1, 1] of each axis for 5 to 10 steps. What the expert would have done is recorded,
-    the push is executed: a policy errs, comes where an undisturbed expert never is, and must know what to do there.
-    DART (Laskey et al. 2017) adds noise to each action for the same reason; the experts here grasp too rarely with it.
+    A push is one random motion in [-1, 1] of each axis for 5 to 10 steps. One of three takes the gripper as well, which
+    may close on nothing or let go. What the expert would have done is recorded, the push is executed: a policy errs,
+    comes where an undisturbed expert never is, and must know what to do there. DART (Laskey et al. 2017) adds noise to
+    each action for the same reason; the experts here grasp too rarely with it.
 
     Args:
         axes: dimensions of the action that move the hand.
+        gripper: dimensions that move the gripper.
         probability: that a push begins, in each step without one.
         seed: of the pushes.
     """
 
-    def __init__(self, axes: Sequence[int], probability: float, seed: int) -> None:
-        self._axes, self._probability = list(axes), probability
+    def __init__(self, axes: Sequence[int], gripper: Sequence[int], probability: float, seed: int) -> None:
+        self._axes, self._gripper, self._probability = list(axes), list(gripper), probability
         self._rng = np.random.default_rng([seed, 1])  # not the environment's numbers, which the seed alone gives
-        self._push: NDArray[np.float32] = np.zeros(len(axes), np.float32)
+        self._pushed: list[int] = []
+        self._push: NDArray[np.float32] = np.zeros(0, np.float32)
         self._n_left = 0
 
     def __call__(self, action: NDArray[np.float32]) -> NDArray[np.float32]:
         """The action to execute instead of the expert's (A,)."""
         if self._n_left == 0 and self._rng.random() < self._probability:
             self._n_left = int(self._rng.integers(*PUSH_STEPS, endpoint=True))
-            self._push = self._rng.uniform(-1, 1, len(self._axes)).astype(np.float32)
+            takes_gripper = self._rng.random() < GRIPPER_SHARE
+            self._pushed = self._axes + self._gripper * takes_gripper
+            self._push = self._rng.uniform(-1, 1, len(self._pushed)).astype(np.float32)
         if self._n_left == 0:
             return action
         self._n_left -= 1
         executed = action.copy()
-        executed[self._axes] = self._push
+        executed[self._pushed] = self._push
         return executed
 
 
@@ -116,7 +123,7 @@ def pushed(attempts: Iterator[Attempt], probability: float, action_names: Sequen
     Args:
         attempts: by seed.
         probability: that a push begins, in each step without one; 0 changes nothing.
-        action_names: of the environment; x, y and z are pushed.
+        action_names: of the environment; x, y, z and gripper are pushed.
 
     Raises:
         UserError: if the probability is not in [0, 1), or no action moves a hand.
@@ -125,10 +132,15 @@ def pushed(attempts: Iterator[Attempt], probability: float, action_names: Sequen
         raise UserError(f"--pushes must be at least 0 (which changes nothing) and below 1, got {probability}.")
     if probability == 0:
         return attempts
-    axes = [index for index, name in enumerate(action_names) if name in ("x", "y", "z")]
+    axes, gripper = (
+        [index for index, name in enumerate(action_names) if name in names] for names in (("x", "y", "z"), ("gripper",))
+    )
     if not axes:
         raise UserError(
             f"--pushes={probability} needs actions that move the hand, named x, y and z as Meta-World's; these are "
             f"{', '.join(action_names)}."
         )
-    return (attempt._replace(pushes=partial(Pushes, axes, probability, attempt.reset["seed"])) for attempt in attempts)
+    return (
+        attempt._replace(pushes=partial(Pushes, axes, gripper, probability, attempt.reset["seed"]))
+        for attempt in attempts
+    )
