@@ -61,9 +61,8 @@ def test_a_seed_decides_the_pushes():
 def test_without_probability_nothing_is_pushed():
     attempts = iter([Attempt({"seed": 1}, steps_of([1, 0]))])
     assert pushed(attempts, 0, ["x"]) is attempts
-    _, executed = next(attempts).actors()
     action = np.ones(1, np.float32)
-    assert executed(action) is action
+    assert next(attempts).disturbance()(action) is action
 
 
 @pytest.mark.parametrize("probability", [-0.1, 1, float("nan")])
@@ -73,20 +72,30 @@ def test_wrong_pushes(probability):
 
 
 def test_pushes_need_a_hand_that_actions_move():
-    with pytest.raises(UserError, match=r"named x, y and z as Meta-World's; these are WRJ1, WRJ0\."):
-        pushed(iter([]), 0.1, ["WRJ1", "WRJ0"])
+    rule = "needs actions x, y and z that move the hand, as metaworld_pointcloud has; these move WRJ1 to LFJ0"
+    with pytest.raises(UserError, match=rule):
+        pushed(iter([]), 0.1, ["WRJ1", "WRJ0", "LFJ0"])
 
 
 def test_a_table_of_experts(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(MetaworldPointCloudEnv, "observe", None)  # nobody looks
     path = tmp_path / "table.csv"
-    main(["demonstrators", "--tasks=drawer-close", "--episodes=2", "--pushes=0.01", f"--output={path}"])
+    main(["demonstrators", "--tasks=drawer-close", "--episodes=2", f"--output={path}"])
     with path.open(newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["task"], row["episodes"], row["demonstrations"]) == ("metaworld/drawer-close", "2", "2")
-    assert row["pushes"] == "0.01"
+    assert row["pushes"] == "0.0"
     assert 0 < float(row["roughness"]) < 1
     assert "metaworld/drawer-close: 2 of 2 (any success: 2)" in capsys.readouterr().out
+
+
+def test_a_table_of_experts_that_are_pushed_all_the_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(MetaworldPointCloudEnv, "observe", None)
+    path = tmp_path / "table.csv"
+    main(["demonstrators", "--tasks=pick-place", "--episodes=1", "--pushes=0.99", f"--output={path}"])
+    with path.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["pushes"], row["demonstrations"]) == ("0.99", "0")
 
 
 def test_a_table_needs_episodes(tmp_path):

@@ -67,6 +67,8 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
         ({"batch_size": 8}, "is not complete"),
         ({**GOOD, "batch_size": 0}, "batch_size must be a whole number above 0, got 0"),
         ({**GOOD, "lengths": {"metaworld": {"steps": 5, "evaluations": 2}}}, "must be a multiple of its evaluations"),
+        ({**GOOD, "pushes": 0.1}, "pushes holds numbers by name, got 0.1"),
+        ({**GOOD, "smoothing": None}, "smoothing holds numbers by name, got None"),
         ({**GOOD, "pushes": {"adroit": 0.1}}, "metaworld alone, got adroit: 0.1"),
         ({**GOOD, "pushes": {"metaworld": 1}}, "from 0 and below 1 by benchmark, metaworld alone, got metaworld: 1"),
         (

@@ -6,6 +6,7 @@ import pytest
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import run_cell as run_cell_module
+from lerobot_uca.protocol import training
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import RunFolder
 from lerobot_uca.protocol.launchers import Ended
@@ -53,6 +54,18 @@ def test_options_are_written_as_draccus_reads_them():
         "--policy.unet_widths=[8, 16]",
         "--root=a",
     ]
+
+
+def test_demonstrations_are_made_as_the_setting_says(tmp_path, monkeypatch):
+    values = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 4, "evaluations": 2}}}
+    disturbed = {"smoothing": {"metaworld/reach": 0.5}, "pushes": {"metaworld": 0.1}}
+    folder = RunFolder.create(tmp_path / "run", Setting.from_values("tiny", {**values, **disturbed}))
+    called = []
+    monkeypatch.setattr(training, "run", lambda command, arguments, **_: called.append((command, arguments)))
+    training.collect(folder, CELL, None)
+    ((command, arguments),) = called
+    assert command == "lerobot-uca-collect"
+    assert {"--env.task=reach", "--n_episodes=10", "--smoothing=0.5", "--pushes=0.1"} <= set(arguments)
 
 
 def test_a_cell_without_space_stops_the_run_and_stays_open(folder, monkeypatch):

@@ -61,8 +61,8 @@ class CollectConfig:
     # that chatters is easier to imitate when it is smoothed, and may even succeed more often (docs/benchmark.md).
     smoothing: float = 1.0
     # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction, and in
-    # one of three pushes the gripper as well. The dataset holds what the expert would have done, also on its way back:
-    # from as many demonstrations a policy learns far more (docs/results.md). 0 leaves the expert undisturbed, as in the
+    # one of three pushes the gripper as well. The dataset holds what the expert would have done, so it shows how to
+    # recover, from which policies may learn far more (docs/results.md). 0 leaves the expert undisturbed, as in the
     # papers.
     pushes: float = 0.0
     # Successful demonstrations of each task.

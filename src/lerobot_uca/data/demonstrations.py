@@ -26,8 +26,7 @@ class Demonstration(NamedTuple):
 
 def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> Demonstration:
     """Run an expert for a whole episode, also past its first success."""
-    env = env_factory()
-    expert, executed = attempt.actors()
+    env, expert, executed = env_factory(), attempt.expert(), attempt.disturbance()
     observation, _ = env.reset(**attempt.reset)
     steps: list[tuple[Any, ...]] = []
     n_successful = 0

@@ -154,6 +154,6 @@ def _demonstrators(args: argparse.Namespace) -> None:
     if args.episodes < 1:
         raise UserError(f"--episodes must be at least 1, got {args.episodes}.")
     tasks = resolve_tasks(args.suite, args.tasks)
-    disturbed = {"smoothing": args.smoothing, "pushes": args.pushes}
-    for row in demonstrators(tasks, args.output, expert=args.expert, n_episodes=args.episodes, **disturbed):
+    options = {"smoothing": args.smoothing, "pushes": args.pushes, "n_episodes": args.episodes}
+    for row in demonstrators(tasks, args.output, expert=args.expert, **options):
         print(f"{row.task}: {row.demonstrations} of {row.episodes} (any success: {row.any_success})")

@@ -7,7 +7,7 @@ import csv
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from lerobot.envs.configs import EnvConfig
@@ -63,8 +63,9 @@ def demonstrators(
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows: list[Demonstrator] = []
-    for task in tqdm(tasks, desc="Experts", unit="task"):
-        make_env, attempts, needed = _of_task(task, expert, smoothing, pushes)
+    prepared = [(task, *_of_task(task, expert, smoothing, pushes)) for task in tasks]  # wrong options are told at once
+    for task, make_env, attempts in tqdm(prepared, desc="Experts", unit="task"):
+        needed = make_env().min_successful_steps
         trials = list(_trials(make_env, islice(attempts, n_episodes)))
         kept = [trial for trial in trials if trial.n_successful >= needed]
         rows.append(
@@ -86,8 +87,7 @@ def demonstrators(
 
 def try_once(make_env: Callable[[], PointCloudEnv], attempt: Attempt) -> Trial:
     """Run an expert for a whole episode, also past its first success, as it is demonstrated."""
-    env = make_env()
-    expert, executed = attempt.actors()
+    env, expert, executed = make_env(), attempt.expert(), attempt.disturbance()
     env.reset(**attempt.reset)
     actions, n_successful, is_over = [], 0, False
     while not is_over:
@@ -106,15 +106,16 @@ def _trials(make_env: Callable[[], PointCloudEnv], attempts: Iterator[Attempt]) 
             yield future.result()
 
 
-def _of_task(task: str, expert: str | None, smoothing: float, pushes: float) -> tuple[Any, Iterator[Attempt], int]:
+def _of_task(
+    task: str, expert: str | None, smoothing: float, pushes: float
+) -> tuple[Callable[[], PointCloudEnv], Iterator[Attempt]]:
     cell = Cell(task, "uca_flow", 0)
     config = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
     assert isinstance(config, PointCloudEnvConfig)
     source = expert if cell.benchmark == "adroit" else None
     attempts = smoothed(config.attempts(cell.env_task, source, FIRST_SEED), smoothing)
     attempts = pushed(attempts, pushes, config.action_names())
-    make_env = config.env_factory(cell.env_task)
-    return make_env, attempts, make_env().min_successful_steps
+    return config.env_factory(cell.env_task), attempts
 
 
 def _write(path: Path, rows: Sequence[Demonstrator]) -> None:

@@ -116,6 +116,9 @@ class Setting:
                     )
 
     def _check_demonstrators(self) -> None:
+        for name in ("smoothing", "pushes"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise UserError(f"Setting '{self.name}': {name} holds numbers by name, got {getattr(self, name)!r}.")
         for task, smoothing in self.smoothing.items():
             if task not in SUITES["all"] or not isinstance(smoothing, int | float) or not 0 < smoothing <= 1:
                 raise UserError(

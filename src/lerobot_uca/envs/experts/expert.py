@@ -12,6 +12,17 @@ from lerobot_uca.errors import UserError
 
 Expert = Callable[[Any], NDArray[np.float32]]
 """Maps an environment to the action that a demonstrator would take in its present state."""
+Disturbance = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""Maps the expert's action to what is executed."""
+
+
+def undisturbed() -> Disturbance:
+    """A disturbance that changes nothing."""
+    return _as_it_is
+
+
+def _as_it_is(action: NDArray[np.float32]) -> NDArray[np.float32]:
+    return action
 
 
 class Attempt(NamedTuple):
@@ -20,16 +31,7 @@ class Attempt(NamedTuple):
     reset: dict[str, Any]
     """Arguments of the environment's `reset`."""
     expert: Callable[[], Expert]
-    pushes: "Callable[[], Pushes] | None" = None
-    """What else moves the hand, if anything does."""
-
-    def actors(self) -> tuple[Expert, Callable[[NDArray[np.float32]], NDArray[np.float32]]]:
-        """The expert, and what becomes of its actions: what the environment executes."""
-        return self.expert(), _as_it_is if self.pushes is None else self.pushes()
-
-
-def _as_it_is(action: NDArray[np.float32]) -> NDArray[np.float32]:
-    return action
+    disturbance: Callable[[], Disturbance] = undisturbed
 
 
 def attempts_by_seed(expert: Callable[[], Expert], first_seed: int) -> Iterator[Attempt]:
@@ -81,16 +83,16 @@ GRIPPER_SHARE = 1 / 3
 
 
 class Pushes:
-    """Something that pushes the hand away now and then, so that the expert shows how it finds back.
+    """Perturbs a demonstration now and then, so that the expert shows how to recover.
 
-    A push is one random motion in [-1, 1] of each axis for 5 to 10 steps. One of three takes the gripper as well, which
-    may close on nothing or let go. What the expert would have done is recorded, the push is executed: a policy errs,
+    For 5 to 10 steps a push replaces the expert's motion of the hand by a random one, and in one of three pushes that
+    of the gripper, which may close on nothing or let go. What the expert would have done is recorded: a policy errs,
     comes where an undisturbed expert never is, and must know what to do there. DART (Laskey et al. 2017) adds noise to
-    each action for the same reason; the experts here grasp too rarely with it.
+    every action for the same reason.
 
     Args:
-        axes: dimensions of the action that move the hand.
-        gripper: dimensions that move the gripper.
+        axes: dimensions of the action that move the hand, in [-1, 1].
+        gripper: dimensions that move the gripper, in [-1, 1].
         probability: that a push begins, in each step without one.
         seed: of the pushes.
     """
@@ -107,7 +109,7 @@ class Pushes:
         if self._n_left == 0 and self._rng.random() < self._probability:
             self._n_left = int(self._rng.integers(*PUSH_STEPS, endpoint=True))
             takes_gripper = self._rng.random() < GRIPPER_SHARE
-            self._pushed = self._axes + self._gripper * takes_gripper
+            self._pushed = self._axes + (self._gripper if takes_gripper else [])
             self._push = self._rng.uniform(-1, 1, len(self._pushed)).astype(np.float32)
         if self._n_left == 0:
             return action
@@ -137,10 +139,10 @@ def pushed(attempts: Iterator[Attempt], probability: float, action_names: Sequen
     )
     if not axes:
         raise UserError(
-            f"--pushes={probability} needs actions that move the hand, named x, y and z as Meta-World's; these are "
-            f"{', '.join(action_names)}."
+            f"--pushes={probability} needs actions x, y and z that move the hand, as metaworld_pointcloud has; these "
+            f"move {action_names[0]} to {action_names[-1]}."
         )
     return (
-        attempt._replace(pushes=partial(Pushes, axes, gripper, probability, attempt.reset["seed"]))
+        attempt._replace(disturbance=partial(Pushes, axes, gripper, probability, attempt.reset["seed"]))
         for attempt in attempts
     )
