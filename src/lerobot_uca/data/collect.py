@@ -62,8 +62,8 @@ class CollectConfig:
     smoothing: float = 1.0
     # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction, and in
     # one of three pushes the gripper as well. The dataset holds what the expert would have done, so it shows how to
-    # recover, which helps where things are picked up and harms elsewhere (docs/results.md). 0 leaves the expert
-    # undisturbed, as in the papers.
+    # recover, which helps some tasks and harms others (docs/results.md). 0 leaves the expert undisturbed, as in the
+    # papers.
     pushes: float = 0.0
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)
