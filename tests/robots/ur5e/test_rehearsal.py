@@ -280,6 +280,17 @@ def test_an_injected_fault_ends_as_documented(tmp_path, fault):
         wait_until(lambda: np.abs(world.scene.arm.qd).max() < 1e-2)
 
 
+def test_an_emergency_stop_is_named_even_where_the_gripper_falls_silent_first(tmp_path):
+    """It loses its power, and may be asked before the arm's next data come."""
+    address = free_address()
+    with SimulatedWorld(address) as world, UR5eFollower(robot_config(address, tmp_path)) as robot:
+        assert robot._gripper is not None
+        robot._gripper._failure = "no value for POS"
+        world.service.fault("emergency_stop")
+        with pytest.raises(ArmStoppedError, match=ENDS["emergency_stop"]):
+            robot.get_observation()
+
+
 def test_the_command_injects_a_fault_once_the_arm_is_steered(tmp_path):
     address = free_address()
     code = "from lerobot_uca.commands import ur5e_sim; ur5e_sim()"

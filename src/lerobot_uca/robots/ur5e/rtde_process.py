@@ -115,6 +115,12 @@ class RtdeProcess:
         if self._failure is not None:
             raise ArmStoppedError(self._failure)
 
+    def raise_failure_within(self, seconds: float) -> None:
+        """Raise `ArmStoppedError` where the arm has stopped, or does so within some seconds."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._failure is not None, seconds)
+            self._raise_failure()
+
     @property
     def is_alive(self) -> bool:
         """Whether the arm takes commands."""

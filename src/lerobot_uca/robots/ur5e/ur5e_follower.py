@@ -35,6 +35,8 @@ from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
 JOINT_KEYS = tuple(f"{joint}.pos" for joint in JOINTS)
 TCP_KEYS = tuple(f"tcp_{axis}.pos" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 GRIPPER_KEY = "gripper.pos"
+ARM_TELLS_WITHIN = 0.2
+"""[s] An emergency stop takes the gripper's power, too; where that is noticed first, the arm's reason follows."""
 
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
 ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
@@ -142,6 +144,7 @@ class UR5eFollower(Robot):
             try:
                 observation[GRIPPER_KEY] = self._gripper.position
             except ArmStoppedError as error:
+                self._arm.raise_failure_within(ARM_TELLS_WITHIN)
                 raise self._stopped(f"{error} The arm was stopped.") from None
         for name, camera in self.cameras.items():
             try:
