@@ -67,8 +67,10 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
         ({"batch_size": 8}, "is not complete"),
         ({**GOOD, "batch_size": 0}, "batch_size must be a whole number above 0, got 0"),
         ({**GOOD, "lengths": {"metaworld": {"steps": 5, "evaluations": 2}}}, "must be a multiple of its evaluations"),
-        ({**GOOD, "pushes": 0.1}, "pushes holds numbers by name, got 0.1"),
-        ({**GOOD, "smoothing": None}, "smoothing holds numbers by name, got None"),
+        ({**GOOD, "pushes": 0.1}, "pushes must hold values by name, got 0.1"),
+        ({**GOOD, "smoothing": None}, "smoothing must hold values by name, got None"),
+        ({**GOOD, "benchmarks": 3}, "benchmarks must hold values by name, got 3"),
+        ({**GOOD, "policies": {"uca_flow": 128}}, "policies.uca_flow must hold values by name, got 128"),
         ({**GOOD, "pushes": {"adroit": 0.1}}, "metaworld alone, got adroit: 0.1"),
         ({**GOOD, "pushes": {"metaworld": 1}}, "from 0 and below 1 by benchmark, metaworld alone, got metaworld: 1"),
         (

@@ -95,6 +95,7 @@ class Setting:
 
     def check(self) -> None:
         """Raise a `UserError` for values that cannot be."""
+        self._check_mappings()
         counts = ("batch_size", "demonstrations", "interim_episodes", "final_episodes")
         for name, value in [(name, getattr(self, name)) for name in counts]:
             if not isinstance(value, int) or value < 1:
@@ -115,10 +116,16 @@ class Setting:
                         f"got '{name}'."
                     )
 
+    def _check_mappings(self) -> None:
+        values = {name: getattr(self, name) for name in ("smoothing", "pushes", "policy", "benchmarks", "policies")}
+        for outer in ("benchmarks", "policies"):
+            if isinstance(values[outer], Mapping):
+                values |= {f"{outer}.{key}": options for key, options in values[outer].items()}
+        for name, value in values.items():
+            if not isinstance(value, Mapping):
+                raise UserError(f"Setting '{self.name}': {name} must hold values by name, got {value!r}.")
+
     def _check_demonstrators(self) -> None:
-        for name in ("smoothing", "pushes"):
-            if not isinstance(getattr(self, name), Mapping):
-                raise UserError(f"Setting '{self.name}': {name} holds numbers by name, got {getattr(self, name)!r}.")
         for task, smoothing in self.smoothing.items():
             if task not in SUITES["all"] or not isinstance(smoothing, int | float) or not 0 < smoothing <= 1:
                 raise UserError(

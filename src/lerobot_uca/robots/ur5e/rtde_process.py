@@ -115,11 +115,11 @@ class RtdeProcess:
         if self._failure is not None:
             raise ArmStoppedError(self._failure)
 
-    def raise_failure_within(self, seconds: float) -> None:
-        """Raise `ArmStoppedError` where the arm has stopped, or does so within some seconds."""
+    def failure_within(self, seconds: float) -> str | None:
+        """Why the arm has stopped, if it has or does so within some seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._failure is not None, seconds)
-            self._raise_failure()
+            return self._failure
 
     @property
     def is_alive(self) -> bool:

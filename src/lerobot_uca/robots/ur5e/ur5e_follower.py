@@ -144,8 +144,8 @@ class UR5eFollower(Robot):
             try:
                 observation[GRIPPER_KEY] = self._gripper.position
             except ArmStoppedError as error:
-                self._arm.raise_failure_within(ARM_TELLS_WITHIN)
-                raise self._stopped(f"{error} The arm was stopped.") from None
+                reason = self._arm.failure_within(ARM_TELLS_WITHIN) or f"{error} The arm was stopped."
+                raise self._stopped(reason) from None
         for name, camera in self.cameras.items():
             try:
                 if getattr(camera, "use_rgb", True):
