@@ -50,6 +50,29 @@ def test_a_dataset_holds_whole_episodes_as_executed(collected):
     assert frames[0]["task"] == env.task_description("drawer-close")
 
 
+def test_a_demonstration_can_end_soon_after_its_success(collected, tmp_path):
+    collect(config(tmp_path / "drawer", successful_steps=10))
+    dataset = LeRobotDataset("test/drawer", root=tmp_path / "drawer")
+    env_config = collected_env()
+    attempt = next(env_config.attempts("drawer-close", None, collecting.FIRST_SEED))
+    env, expert = env_config.env_factory("drawer-close")(), attempt.expert()
+    env.reset(**attempt.reset)
+    n_steps = n_successful = 0
+    while n_successful < 10:
+        *_, info = env.step(expert(env))
+        n_steps, n_successful = n_steps + 1, n_successful + info["is_success"]
+    assert len(dataset) == n_steps < 100
+    for short, whole in zip(dataset, collected, strict=False):
+        for key in (OBS_POINT_CLOUD, "observation.state", "action"):
+            np.testing.assert_array_equal(short[key], whole[key])
+
+
+def test_a_demonstration_cannot_end_before_it_is_one(tmp_path):
+    with pytest.raises(UserError, match=r"--successful_steps must be at least 5, .* metaworld_pointcloud .*, got 4"):
+        collect(config(tmp_path / "new", successful_steps=4))
+    assert not (tmp_path / "new").exists()
+
+
 def test_of_a_pushed_hand_the_dataset_holds_what_the_expert_would_have_done(tmp_path):
     env_config = collected_env()
     collect(config(tmp_path / "drawer", pushes=0.05))

@@ -73,6 +73,12 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
         ({**GOOD, "policies": {"uca_flow": 128}}, "policies.uca_flow must hold values by name, got 128"),
         ({**GOOD, "pushes": {"adroit": 0.1}}, "metaworld alone, got adroit: 0.1"),
         ({**GOOD, "pushes": {"metaworld": 1}}, "from 0 and below 1 by benchmark, metaworld alone, got metaworld: 1"),
+        ({**GOOD, "successful_steps": 10}, "successful_steps must hold values by name, got 10"),
+        (
+            {**GOOD, "successful_steps": {"metaworld": 0}},
+            "whole numbers above 0 by benchmark (adroit, metaworld), got metaworld: 0",
+        ),
+        ({**GOOD, "successful_steps": {"libero": 5}}, "by benchmark (adroit, metaworld), got libero: 5"),
         (
             {**GOOD, "benchmarks": {"libero": {}}},
             "benchmarks holds options by benchmark (adroit, metaworld), got 'libero'",

@@ -58,14 +58,19 @@ def test_options_are_written_as_draccus_reads_them():
 
 def test_demonstrations_are_made_as_the_setting_says(tmp_path, monkeypatch):
     values = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 4, "evaluations": 2}}}
-    disturbed = {"smoothing": {"metaworld/reach": 0.5}, "pushes": {"metaworld": 0.1}}
+    disturbed = {
+        "smoothing": {"metaworld/reach": 0.5},
+        "pushes": {"metaworld": 0.1},
+        "successful_steps": {"metaworld": 7},
+    }
     folder = RunFolder.create(tmp_path / "run", Setting.from_values("tiny", {**values, **disturbed}))
     called = []
     monkeypatch.setattr(training, "run", lambda command, arguments, **_: called.append((command, arguments)))
     training.collect(folder, CELL, None)
     ((command, arguments),) = called
     assert command == "lerobot-uca-collect"
-    assert {"--env.task=reach", "--n_episodes=10", "--smoothing=0.5", "--pushes=0.1"} <= set(arguments)
+    expected = {"--env.task=reach", "--n_episodes=10", "--smoothing=0.5", "--pushes=0.1", "--successful_steps=7"}
+    assert expected <= set(arguments)
 
 
 def test_a_cell_without_space_stops_the_run_and_stays_open(folder, monkeypatch):

@@ -24,8 +24,10 @@ class Demonstration(NamedTuple):
     is_successful: bool
 
 
-def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> Demonstration:
-    """Run an expert for a whole episode, also past its first success."""
+def demonstrate(
+    env_factory: Callable[[], PointCloudEnv], attempt: Attempt, successful_steps: int | None = None
+) -> Demonstration:
+    """Run an expert past its first success, to the end of the episode or until so many steps were successful."""
     env, expert, executed = env_factory(), attempt.expert(), attempt.disturbance()
     observation, _ = env.reset(**attempt.reset)
     steps: list[tuple[Any, ...]] = []
@@ -36,18 +38,22 @@ def demonstrate(env_factory: Callable[[], PointCloudEnv], attempt: Attempt) -> D
         steps.append((observation[env.observer.key], observation["agent_pos"], action))
         observation, _, terminated, truncated, info = env.step(executed(action))
         n_successful += info["is_success"]
-        is_over = truncated or (terminated and not info["is_success"])
+        is_over = truncated or (terminated and not info["is_success"]) or n_successful == successful_steps
     env.close()
     seen, state, actions = (np.stack(column) for column in zip(*steps, strict=True))
     return Demonstration(seen, state, actions, n_successful >= env.min_successful_steps)
 
 
 def demonstrations(
-    env_factory: Callable[[], PointCloudEnv], attempts: Iterator[Attempt], *, n_wanted: int
+    env_factory: Callable[[], PointCloudEnv],
+    attempts: Iterator[Attempt],
+    *,
+    n_wanted: int,
+    successful_steps: int | None = None,
 ) -> Generator[Demonstration]:
     """Episodes of the attempts in order, until n_wanted were successful or the attempts are used up.
 
-    One process a core runs them.
+    One process a core runs them, each as `demonstrate` does.
     """
     n_workers = os.cpu_count() or 1
     pending: deque[Future[Demonstration]] = deque()
@@ -56,7 +62,8 @@ def demonstrations(
         while n_missing:
             # Never more than may still be needed: leaving the pool waits for running episodes.
             n_idle = max(0, min(n_missing, n_workers + 1) - len(pending))
-            pending.extend(pool.submit(demonstrate, env_factory, attempt) for attempt in islice(attempts, n_idle))
+            new = islice(attempts, n_idle)
+            pending.extend(pool.submit(demonstrate, env_factory, attempt, successful_steps) for attempt in new)
             if not pending:
                 return
             episode = pending.popleft().result()

@@ -50,6 +50,8 @@ class Setting:
     """The smoothing of experts' actions by task, as for lerobot-uca-collect."""
     pushes: Mapping[str, float] = field(default_factory=dict)
     """The probability of pushes by benchmark, as for lerobot-uca-collect."""
+    successful_steps: Mapping[str, int] = field(default_factory=dict)
+    """Successful steps after which a demonstration ends, by benchmark, as for lerobot-uca-collect."""
     interim_episodes: int = 20
     """Episodes of each evaluation during training."""
     final_episodes: int = 100
@@ -117,7 +119,8 @@ class Setting:
                     )
 
     def _check_mappings(self) -> None:
-        values = {name: getattr(self, name) for name in ("smoothing", "pushes", "policy", "benchmarks", "policies")}
+        names = ("smoothing", "pushes", "successful_steps", "policy", "benchmarks", "policies")
+        values = {name: getattr(self, name) for name in names}
         for outer in ("benchmarks", "policies"):
             if isinstance(values[outer], Mapping):
                 values |= {f"{outer}.{key}": options for key, options in values[outer].items()}
@@ -137,6 +140,13 @@ class Setting:
                 raise UserError(
                     f"Setting '{self.name}': pushes holds a number from 0 and below 1 by benchmark, metaworld alone, "
                     f"got {benchmark}: {probability!r}."
+                )
+
+        for benchmark, n_steps in self.successful_steps.items():
+            if benchmark not in ENVIRONMENTS or type(n_steps) is not int or n_steps < 1:
+                raise UserError(
+                    f"Setting '{self.name}': successful_steps holds whole numbers above 0 by benchmark "
+                    f"({', '.join(ENVIRONMENTS)}), got {benchmark}: {n_steps!r}."
                 )
 
     def as_values(self) -> dict[str, Any]:

@@ -42,6 +42,8 @@ def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
                 "smoothing": folder.setting.smoothing.get(cell.task, 1.0),
                 "pushes": folder.setting.pushes.get(cell.benchmark, 0.0),
             }
+            if cell.benchmark in folder.setting.successful_steps:
+                options["successful_steps"] = folder.setting.successful_steps[cell.benchmark]
             if expert is not None and cell.benchmark == "adroit":
                 options["expert"] = expert
             run("lerobot-uca-collect", as_arguments(options), log=folder.cell(cell).path / "collect.log")
