@@ -1,13 +1,16 @@
-"""Error of a policy's actions on its own demonstrations, by episode.
+"""Error of a policy's actions on its own demonstrations, by episode and by step of the episodes.
 
 python benchmarks/fit.py outputs/door/training/checkpoints/last/pretrained_model outputs/door/dataset
 
 Errors are root mean squares of normalised actions, in [-1, 1]. 'change' is how far the expert's own action moves from
 one step to the next: what is high there and in the error is chatter that positions and clouds do not foretell.
+'constant' is the error of one action for all episodes at each step, their mean: a policy that is no better there does
+not use what it sees.
 """
 
 import argparse
 import logging
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -20,9 +23,12 @@ from torch.utils.data import default_collate
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.features import OBS_POINT_CLOUD
 
+PHASES = (0, 8, 20, 40, 80, 1000)
+"""First steps of the phases that episodes are looked at by, and the last one's end."""
+
 
 def main() -> None:
-    """Print a row for each demonstration, and one for all."""
+    """Print a row for each demonstration, one for all, and one for each phase."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("dataset", type=Path)
@@ -54,6 +60,16 @@ def main() -> None:
         own = error[of][executed[of]]
         row = (rms(own), own.abs().median().item(), rms(change[of][moves[of]]), rms(expert[of][~padded[of]]))
         print(f"{episode:>8}" + "".join(f"{value:9.3f}" for value in row))
+    print(f"{'steps':>8}{'error':>9}{'constant':>9}")
+    now = config.executed.start
+    error, expert, step = error[:, 0], expert[:, now], raw["frame_index"]
+    for first, end in pairwise(PHASES):
+        steps = [step == at for at in range(first, min(end, int(step.max()) + 1))]
+        if steps:
+            spread = torch.cat([expert[of] - expert[of].mean(dim=0) for of in steps])
+            own = torch.cat([error[of] for of in steps])
+            last = first + len(steps) - 1
+            print(f"{f'{first}-{last}':>8}{rms(own):9.3f}{rms(spread):9.3f}")
 
 
 def rms(values: Tensor) -> float:
