@@ -121,9 +121,11 @@ def _attempts(config: CollectConfig, env_config: PointCloudEnvConfig) -> dict[st
 
 
 def _check_successful_steps(config: CollectConfig, env_config: PointCloudEnvConfig) -> None:
+    if config.successful_steps is None:
+        return
     task = next(task for tasks in env_config.tasks().values() for task in tasks)
     least = env_config.env_factory(task)().min_successful_steps
-    if config.successful_steps is not None and config.successful_steps < least:
+    if config.successful_steps < least:
         raise UserError(
             f"--successful_steps must be at least {least}, as many as make an episode of {env_config.type} a "
             f"demonstration, got {config.successful_steps}."
