@@ -23,8 +23,8 @@ from torch.utils.data import default_collate
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.features import OBS_POINT_CLOUD
 
-PHASES = (0, 8, 20, 40, 80, 1000)
-"""First steps of the phases that episodes are looked at by, and the last one's end."""
+PHASES = (0, 8, 20, 40, 80)
+"""First steps of the phases that episodes are looked at by."""
 
 
 def main() -> None:
@@ -63,13 +63,12 @@ def main() -> None:
     print(f"{'steps':>8}{'error':>9}{'constant':>9}")
     now = config.executed.start
     error, expert, step = error[:, 0], expert[:, now], raw["frame_index"]
-    for first, end in pairwise(PHASES):
-        steps = [step == at for at in range(first, min(end, int(step.max()) + 1))]
-        if steps:
-            spread = torch.cat([expert[of] - expert[of].mean(dim=0) for of in steps])
-            own = torch.cat([error[of] for of in steps])
-            last = first + len(steps) - 1
-            print(f"{f'{first}-{last}':>8}{rms(own):9.3f}{rms(spread):9.3f}")
+    end = int(step.max()) + 1
+    for first, after in pairwise([*(first for first in PHASES if first < end), end]):
+        steps = [step == at for at in range(first, after)]
+        spread = torch.cat([expert[of] - expert[of].mean(dim=0) for of in steps])
+        own = torch.cat([error[of] for of in steps])
+        print(f"{f'{first}-{after - 1}':>8}{rms(own):9.3f}{rms(spread):9.3f}")
 
 
 def rms(values: Tensor) -> float:

@@ -67,7 +67,7 @@ class CollectConfig:
     pushes: float = 0.0
     # A demonstration ends after so many successful steps. By default it goes on to the end of the episode, as the
     # baselines' do, so half of a dataset may show what happens after the success, where nothing is left to learn: with
-    # 10, policies learn Meta-World's tasks better (docs/results.md).
+    # 10, Meta-World's tasks are solved more often in the mean (docs/results.md).
     successful_steps: int | None = within(None, least=1, most=1_000_000)
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)

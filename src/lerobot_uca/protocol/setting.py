@@ -141,7 +141,6 @@ class Setting:
                     f"Setting '{self.name}': pushes holds a number from 0 and below 1 by benchmark, metaworld alone, "
                     f"got {benchmark}: {probability!r}."
                 )
-
         for benchmark, n_steps in self.successful_steps.items():
             if benchmark not in ENVIRONMENTS or type(n_steps) is not int or n_steps < 1:
                 raise UserError(
