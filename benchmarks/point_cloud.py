@@ -74,7 +74,7 @@ def measure(config: PointCloudEnvConfig, task: str, expert: Expert, n_steps: int
         near_rays, _ = timed(before.cast_near, *scene)
         rays, hits = timed(camera._caster.cast, *scene)
         crop_before, _ = timed(crop_as_before, camera, hits.distance.copy(), env._markers())
-        crop, points = timed(camera.points, hits.distance, env._markers())
+        crop, points = timed(camera.points, scene[0], hits, env._markers())
         sample, _ = timed(sample_farthest, points, env.n_points)
         observe, _ = timed(env.observe)
         picture, _ = timed(env.render)

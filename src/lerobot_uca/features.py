@@ -1,6 +1,7 @@
 """Names of the features that datasets, environments and policies share, besides LeRobot's own."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 OBS_POINT_CLOUD = "observation.point_cloud"
 """(N, 3) float32 [m], in the frame that the environment or robot states; with colours (N, 6), RGB after xyz."""
@@ -10,6 +11,12 @@ ENV_NAMES = {"point_cloud": OBS_POINT_CLOUD, "agent_pos": "observation.state"}
 
 POINT_CLOUD_KEYS = (OBS_POINT_CLOUD, "observation.pointcloud", "observation.pointcloud.xyz")
 """Keys under which a point cloud is found, in this order: this package's and other plugins'."""
+
+POINT_CLOUD, OBJECT_CLOUD = "point_cloud", "object_cloud"
+"""The environments' observations that are clouds, with the robot in them and without."""
+
+OBSERVATION_INFO = "observation"
+"""features[key]['info'][OBSERVATION_INFO] says which of them a dataset's cloud is; POINT_CLOUD if nothing does."""
 
 VALID_MASK_SUFFIX = ".valid_mask"
 """Appended to a cloud's key (without .xyz), it names which of its points are valid, (N,) bool."""
@@ -25,3 +32,10 @@ def valid_mask(key: str, keys: Iterable[str]) -> str | None:
     """The key of the mask that belongs to the point cloud under a key, if it is among these."""
     mask = key.removesuffix(".xyz") + VALID_MASK_SUFFIX
     return mask if mask in set(keys) else None
+
+
+def cloud_observation(features: Mapping[str, Mapping[str, Any]]) -> str:
+    """Which of the environments' observations the cloud of a dataset's features is."""
+    key = find_point_cloud(features)
+    info = {} if key is None else features[key].get("info") or {}
+    return info.get(OBSERVATION_INFO, POINT_CLOUD)

@@ -34,7 +34,7 @@ from lerobot_uca.checkpoints.steps import check_steps
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
 from lerobot_uca.errors import UserError, reported
-from lerobot_uca.features import ENV_NAMES, find_point_cloud, valid_mask
+from lerobot_uca.features import ENV_NAMES, cloud_observation, find_point_cloud, valid_mask
 from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.lerobot_version import is_supported
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
@@ -270,6 +270,7 @@ def check_settings() -> None:
     """A folder that cannot be written, or that another training writes, is refused at once, wrong settings in one line.
 
     LeRobot finds the first out at the first checkpoint or video, the second never, and shows a traceback for the third.
+    Nor does it ask whether an environment's clouds are those of the training.
     """
 
     def validated(validate: Callable[..., None]) -> Callable[..., None]:
@@ -293,6 +294,7 @@ def check_settings() -> None:
             make(self)
             if isinstance(self.policy, PointCloudPolicyConfig):
                 check_output_folder(self.output_dir)
+                self.policy.check_environment(self.env)
 
         return make_and_check
 
@@ -356,6 +358,7 @@ def normalise_what_is_trained() -> None:
         def make_train_eval_datasets(config: TrainPipelineConfig) -> Any:
             datasets = make(config)
             if isinstance(config.policy, PointCloudPolicyConfig):
+                config.policy.check_environment(config.env, cloud_observation(datasets[0].meta.features))
                 for dataset in filter(None, datasets):
                     _normalise_by_chosen_episodes(config.policy, dataset, config.rename_map)
             return datasets

@@ -146,7 +146,9 @@ def test_depth_is_of_one_camera_and_one_crop():
     config = depth_config("metaworld_pointcloud", "drawer-close,hand-insert")
     with pytest.raises(UserError, match="depth needs tasks of one camera and one crop, got 2 in"):
         config.validate()
-    with pytest.raises(UserError, match=r"env\.observation must be one of point_cloud, depth, got 'colour'"):
+    with pytest.raises(
+        UserError, match=r"env\.observation must be one of point_cloud, object_cloud, depth, got"
+    ):
         make_env_config("metaworld_pointcloud", task="reach", observation="colour").validate()
     assert make_env_config("metaworld_pointcloud", task="drawer-close,reach").recipe() is not None
 

@@ -26,10 +26,10 @@ from lerobot_uca.policies.modeling_base import PointCloudPolicy
 from lerobot_uca.whole_file import whole_file
 
 # These steps do the same for all observations, so that a trace of them holds. A file takes clouds: the step that
-# makes them from depth images has nothing to do, nor has the one that changes training's.
+# makes them from depth images has nothing to do, nor have those that change training's.
 TRACEABLE_STEPS = {
     *("rename_observations_processor", "depth_to_cloud_processor", "point_cloud_processor", "to_batch_processor"),
-    *("cloud_augmentation_processor", "hand_frame_processor"),
+    *("cloud_augmentation_processor", "scene_turn_processor", "hand_frame_processor"),
     *("device_processor", "normalizer_processor", "unnormalizer_processor"),
 }
 FILES = ("config.json", "policy_preprocessor.json", "policy_postprocessor.json")

@@ -178,6 +178,7 @@ class AdroitPointCloudEnv(PointCloudEnv):
     """
 
     benchmark = "Adroit"
+    robot = "forearm"
     min_successful_steps = 1
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium's own declaration)
 

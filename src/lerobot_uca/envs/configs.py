@@ -20,7 +20,7 @@ from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
 from lerobot_uca.envs.observers import OBSERVERS, depth_name
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, POINT_CLOUD
 from lerobot_uca.point_clouds.calibration import Calibration
 from lerobot_uca.point_clouds.geometry import Camera, Crop
 from lerobot_uca.point_clouds.recipe import SIMULATED, CloudRecipe, DepthSource
@@ -34,8 +34,9 @@ class PointCloudEnvConfig(EnvConfig):
 
     # Points of each cloud.
     n_points: int = within(512, least=1, most=100_000)
-    # The observation besides the robot's state: point_cloud, or depth, the image that such a cloud is made from.
-    observation: str = "point_cloud"
+    # The observation besides the robot's state: point_cloud; object_cloud, which leaves out the robot's own points; or
+    # depth, the image that a point_cloud is made from.
+    observation: str = POINT_CLOUD
 
     def __post_init__(self) -> None:
         with suppress(UserError):  # of wrong tasks; validate() tells it, here draccus would swallow the message
@@ -74,9 +75,9 @@ class PointCloudEnvConfig(EnvConfig):
         return list(dict.fromkeys(self.view(task) for tasks in self.tasks().values() for task in tasks))
 
     def recipe(self) -> CloudRecipe | None:
-        """The recipe for clouds from depth images; None if the tasks differ in camera or crop."""
+        """The recipe for clouds from depth images; None if the tasks differ in camera or crop, or clouds are others."""
         views = self._views()
-        if len(views) != 1:
+        if len(views) != 1 or self.observation == OBJECT_CLOUD:
             return None
         ((camera, crop),) = views
         calibration = Calibration(camera, serial=SIMULATED, method=SIMULATED)

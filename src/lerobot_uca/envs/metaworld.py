@@ -121,10 +121,11 @@ class MetaworldPointCloudEnv(PointCloudEnv):
     Args:
         task: a name from `task_descriptions()`, with or without '-v3'.
         n_points: points of the cloud.
-        observation: point_cloud or depth.
+        observation: point_cloud, object_cloud or depth.
     """
 
     benchmark = "Meta-World"
+    robot = "base"
     min_successful_steps = 5  # the baselines' rule
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012 (Gymnasium's own declaration)
     _max_episode_steps = EPISODE_LENGTH  # LeRobot reads it

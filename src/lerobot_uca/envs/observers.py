@@ -1,6 +1,7 @@
 """Observing a simulated scene: as a point cloud, or as the depth image that a policy makes its cloud from."""
 
 from collections.abc import Sequence
+from typing import override
 
 import gymnasium as gym
 import mujoco
@@ -8,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBJECT_CLOUD, POINT_CLOUD
 from lerobot_uca.point_clouds.cameras import DepthCamera, Marker, PointCloudCamera
 from lerobot_uca.point_clouds.depth import to_millimetres
-from lerobot_uca.point_clouds.geometry import Camera, Crop, sample_farthest
+from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, sample_farthest
 
 
 class CloudObserver:
@@ -21,7 +23,7 @@ class CloudObserver:
 
     key = "point_cloud"
 
-    def __init__(self, camera: Camera, crop: Crop, n_points: int) -> None:
+    def __init__(self, camera: Camera, crop: Crop, n_points: int, robot: str) -> None:  # noqa: ARG002 (the others')
         self.camera = PointCloudCamera(camera, crop)
         self.n_points = n_points
         self.space = gym.spaces.Box(-np.inf, np.inf, (n_points, 3), np.float32)
@@ -32,7 +34,7 @@ class CloudObserver:
         Raises:
             UserError: if it is empty.
         """
-        points = self.camera.capture(model, data, markers)
+        points = self._points(model, data, markers)
         if len(points) == 0:
             camera, crop = self.camera.camera, self.camera.crop
             raise UserError(
@@ -41,11 +43,31 @@ class CloudObserver:
             )
         return sample_farthest(points, self.n_points)
 
+    def _points(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker]) -> Array:
+        return self.camera.capture(model, data, markers)
+
+
+class ObjectCloudObserver(CloudObserver):
+    """The same without the robot, which its state tells: a self-filter, as on a real arm whose shape is known.
+
+    Of 128 points up to 117 lie on the robot (Meta-World's reach), each of which is one fewer on the task. Should it
+    hide everything else, the cloud is the robot's.
+    """
+
+    def __init__(self, camera: Camera, crop: Crop, n_points: int, robot: str) -> None:
+        super().__init__(camera, crop, n_points, robot)
+        self._objects = PointCloudCamera(camera, crop, left_out=robot)
+
+    @override
+    def _points(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker]) -> Array:
+        points = self._objects.capture(model, data, markers)
+        return points if len(points) else super()._points(model, data, markers)
+
 
 class DepthObserver:
     """A depth image as a RealSense camera gives it, (1, height, width) uint16 [mm], 0 where nothing is."""
 
-    def __init__(self, camera: Camera, crop: Crop, n_points: int) -> None:  # noqa: ARG002 (as CloudObserver's)
+    def __init__(self, camera: Camera, crop: Crop, n_points: int, robot: str) -> None:  # noqa: ARG002 (the others')
         self.camera = DepthCamera(camera)
         self.key = depth_name(camera)
         self.space = gym.spaces.Box(0, np.iinfo(np.uint16).max, (1, camera.height, camera.width), np.uint16)
@@ -56,7 +78,11 @@ class DepthObserver:
 
 
 Observer = CloudObserver | DepthObserver
-OBSERVERS: dict[str, type[Observer]] = {"point_cloud": CloudObserver, "depth": DepthObserver}
+OBSERVERS: dict[str, type[Observer]] = {
+    POINT_CLOUD: CloudObserver,
+    OBJECT_CLOUD: ObjectCloudObserver,
+    "depth": DepthObserver,
+}
 
 
 def depth_name(camera: Camera) -> str:

@@ -22,8 +22,8 @@ class PointCloudEnv(gym.Env[Any, Any]):
     """One task of a MuJoCo benchmark, observed as a point cloud, or a depth image, and the robot's own state.
 
     Observation:
-        point_cloud: (n_points, 3) float32, world frame [m], or
-        images.<camera>_depth: (1, height, width) uint16 [mm]; see `CloudObserver` and `DepthObserver`.
+        point_cloud: (n_points, 3) float32, world frame [m], with or without the robot, or
+        images.<camera>_depth: (1, height, width) uint16 [mm]; see `OBSERVERS`.
         agent_pos: (n_states,) float32, the robot's own state, in the benchmark's units.
     Action: (n_actions,) float32 in [-1, 1]; what lies outside is clipped.
     The simulator is created at the first reset, so that vector environments build it in their workers.
@@ -39,6 +39,8 @@ class PointCloudEnv(gym.Env[Any, Any]):
     """
 
     benchmark: ClassVar[str]
+    robot: ClassVar[str]
+    """The body that the whole robot hangs on."""
     min_successful_steps: ClassVar[int]
     """Successful steps that make an episode a demonstration."""
     render_mode = "rgb_array"
@@ -58,7 +60,7 @@ class PointCloudEnv(gym.Env[Any, Any]):
     ) -> None:
         self.task, self.task_description = task, description
         self.n_points, self.crop = n_points, crop
-        self.observer: Observer = OBSERVERS[observation](camera, crop, n_points)
+        self.observer: Observer = OBSERVERS[observation](camera, crop, n_points, self.robot)
         self.observation_space = gym.spaces.Dict(
             {
                 self.observer.key: self.observer.space,

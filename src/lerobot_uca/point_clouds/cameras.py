@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, ray_sphere_distances
 from lerobot_uca.point_clouds.ray_casting import RayCaster
-from lerobot_uca.point_clouds.rays import Rays
+from lerobot_uca.point_clouds.rays import NO_GEOM, Hits, Rays
 
 ROUNDING = 1e-9  # [m], far above that of a distance and far below what a camera resolves
 MIN_LENGTH = 1e-30  # [m]; a ray without a hit has a normal of length 0
@@ -35,12 +35,15 @@ class PointCloudCamera:
     Args:
         camera: where the rays start and which way they go.
         crop: what to keep. Rays that miss it are never cast.
+        left_out: name of a body that, with all that hangs on it, hides what is behind it but gives no points.
     """
 
-    def __init__(self, camera: Camera, crop: Crop) -> None:
+    def __init__(self, camera: Camera, crop: Crop, left_out: str | None = None) -> None:
         origin = camera.position
         directions = camera.ray_directions()
         self.camera, self.crop = camera, crop
+        self._left_out = left_out
+        self._model: mujoco.MjModel | None = None
         enter, leave = crop.span(origin, directions)
         meets = enter <= leave
         self._caster = RayCaster(camera, meets)
@@ -48,17 +51,28 @@ class PointCloudCamera:
 
     def capture(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker] = ()) -> Array:
         """Visible points inside the crop, (N, 3), world frame [m]. `data` must be up to date (`mj_forward`)."""
-        distance = self._caster.cast(model, data).distance
-        return self.points(distance, markers)
+        return self.points(model, self._caster.cast(model, data), markers)
 
-    def points(self, distance: Array, markers: Sequence[Marker]) -> Array:
-        """Points inside the crop at surfaces' distances (R,) along the rays [m], or at markers before them, (N, 3)."""
-        rays = self._caster.rays
+    def points(self, model: mujoco.MjModel, hits: Hits, markers: Sequence[Marker]) -> Array:
+        """Points inside the crop at the hits of its rays, which it changes, or at markers before them, (N, 3)."""
+        rays, (distance, geom, _) = self._caster.rays, hits
         for marker in markers:
-            _put_nearer(distance, rays, marker)
+            geom[_put_nearer(distance, rays, marker)] = NO_GEOM
+        if self._left_out is not None:
+            distance[self._is_left_out(model)[geom]] = np.inf
         near = np.flatnonzero((distance >= self._enter) & (distance <= self._leave))
         points = rays.origin + rays.directions[near] * distance[near, None]
         return points[self.crop.contains(points)]
+
+    def _is_left_out(self, model: mujoco.MjModel) -> NDArray[np.bool_]:
+        """Whether each geom is, (ngeom + 1,): the last one, at `NO_GEOM`, is none."""
+        if model is not self._model:
+            self._model, root = model, model.body(self._left_out).id
+            bodies = np.arange(model.nbody) == root
+            for body in range(root + 1, model.nbody):  # parents come first
+                bodies[body] |= bodies[model.body_parentid[body]]
+            self._left_out_geoms = np.append(bodies[model.geom_bodyid], False)
+        return self._left_out_geoms
 
 
 class DepthCamera:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from lerobot_uca.point_clouds.geometry import Array, Camera
 
 NEAREST_DEPTH = 1e-3  # [m]; what is nearer to the camera's plane, or behind it, has no exact projection
+NO_GEOM = -1
+"""A hit's geom where nothing was hit."""
 _CUBE = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
@@ -48,14 +50,14 @@ class Hits(NamedTuple):
     """The first hits of R rays."""
 
     distance: Array  # (R,) [m], inf where nothing was hit
-    geom: NDArray[np.int32]  # (R,), -1 where nothing was hit
+    geom: NDArray[np.int32]  # (R,), `NO_GEOM` where nothing was hit
     normal: Array  # (R, 3), of any length; (0, 3) without normals
 
     @classmethod
     def none(cls, n_rays: int, *, with_normals: bool) -> Self:
         """Nothing was hit yet."""
         normal = np.zeros((n_rays if with_normals else 0, 3))
-        return cls(np.full(n_rays, np.inf), np.full(n_rays, -1, np.int32), normal)
+        return cls(np.full(n_rays, np.inf), np.full(n_rays, NO_GEOM, np.int32), normal)
 
     def copy(self) -> Self:
         """The same in memory of its own."""

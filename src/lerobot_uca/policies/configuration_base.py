@@ -10,9 +10,9 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud
+from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, POINT_CLOUD, cloud_observation, find_point_cloud
 from lerobot_uca.inference.backends import BACKENDS
-from lerobot_uca.policies.augmentation_config import AugmentationConfig
+from lerobot_uca.policies.augmentation_config import AugmentationConfig, SceneTurnConfig
 from lerobot_uca.policies.depth_config import DepthConfig
 from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
@@ -54,11 +54,18 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # clouds are then seen from the hand. The paper's and the baselines' clouds, and by default ours, are not.
     hand_position: tuple[int, ...] | None = None
 
+    # The environments' observation that training's clouds are: point_cloud, or object_cloud, without the robot. Written
+    # by training, not for users; evaluation checks that its environment gives the same.
+    observation: str = POINT_CLOUD
+
     # Training from depth images, which become clouds.
     depth: DepthConfig = field(default_factory=DepthConfig)
 
     # Changes to training's clouds as a real camera would make them.
     augmentation: AugmentationConfig = field(default_factory=AugmentationConfig)
+
+    # Training's scenes turned about the hand, with the motion to learn.
+    scene_turn: SceneTurnConfig = field(default_factory=SceneTurnConfig)
 
     # LeRobot takes the point cloud for a state: it is normalised by channel.
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -106,6 +113,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         """Raise a `UserError` for values outside their bounds or that do not fit together."""
         check_bounds(self, "policy")
         check_bounds(self.augmentation, "policy.augmentation")
+        check_bounds(self.scene_turn, "policy.scene_turn")
         if self.horizon < self.executed.stop:
             raise UserError(
                 f"policy.horizon must be at least (n_obs_steps - 1) * obs_stride + n_action_steps = "
@@ -151,6 +159,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
                 f"policy.hand_position must be three different dimensions of '{OBS_STATE}', "
                 f"0 to {state.shape[0] - 1}, or null, got {list(hand)}."
             )
+        self.scene_turn.check(hand, state.shape[0], action.shape[0])
         self.input_features: dict[str, PolicyFeature] | None = {
             OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (cloud.shape[0], n_channels)),
             OBS_STATE: PolicyFeature(FeatureType.STATE, tuple(state.shape)),
@@ -164,6 +173,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         Raises:
             UserError: if depth images lack a calibration or a crop, or do not fit the checkpoint to be trained further.
         """
+        self.observation = cloud_observation(features)
         knows_clouds = self.depth.recipe is not None
         recipe = self.depth.settle(features)
         cloud_key = find_point_cloud(features)
@@ -200,6 +210,20 @@ class PointCloudPolicyConfig(PreTrainedConfig):
                 raise UserError(
                     f"'{key}' must have the checkpoint's shape {tuple(before[key].shape)}, got {shape} in the dataset."
                 )
+
+    def check_environment(self, env: Any, observation: str | None = None) -> None:
+        """Raise a `UserError` if one of policy and environment sees the robot's own points and the other does not.
+
+        Args:
+            env: LeRobot's configuration of an environment, this package's or another's; None for none.
+            observation: what training's clouds are, if the policy does not know it yet.
+        """
+        trained, given = observation or self.observation, getattr(env, "observation", POINT_CLOUD)
+        if env is not None and trained != given and OBJECT_CLOUD in (trained, given):
+            raise UserError(
+                f"The policy's training has clouds of env.observation={trained}, the environment gives {given}: add "
+                f"--env.observation={trained}."
+            )
 
     @property
     def n_channels(self) -> int:

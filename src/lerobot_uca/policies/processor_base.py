@@ -29,6 +29,7 @@ from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_augmentation import CloudAugmentationProcessorStep, augmentation_steps
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
 from lerobot_uca.policies.processor_hand_frame import HandFrameProcessorStep, hand_frame_steps
+from lerobot_uca.policies.processor_scene_turn import SceneTurnProcessorStep, scene_turn_steps
 from lerobot_uca.policies.statistics import check_statistics, settled_statistics
 
 logger = logging.getLogger(__name__)
@@ -57,6 +58,7 @@ def make_processors(
             DepthToCloudProcessorStep(recipe=config.depth.recipe),
             PointCloudProcessorStep(config.n_points, config.colour),
             *augmentation_steps(config),
+            *scene_turn_steps(config),
             *hand_frame_steps(config, stats[OBS_STATE]),
             steps.add_batch_dim,
             steps.to_device,
@@ -123,7 +125,7 @@ def _check_pipelines(
             stats = {name: value for (of, _, name), value in stats.items() if of == key}
             check_statistics(key, stats, config, where=f"the {kind._registry_name}'s in '{checkpoint}'")
             state_statistics = stats if key == OBS_STATE else state_statistics
-    own = CloudAugmentationProcessorStep, HandFrameProcessorStep
+    own = CloudAugmentationProcessorStep, SceneTurnProcessorStep, HandFrameProcessorStep
     steps = [each for each in pre.steps if not isinstance(each, own)]
     kinds = [type(each) for each in steps]
     if PointCloudProcessorStep not in kinds:
@@ -132,7 +134,11 @@ def _check_pipelines(
         steps.insert(kinds.index(PointCloudProcessorStep), PointCloudProcessorStep())
     place = kinds.index(PointCloudProcessorStep)
     steps[place] = PointCloudProcessorStep(config.n_points, config.colour)
-    made = [*augmentation_steps(config), *hand_frame_steps(config, state_statistics)]
+    made = [
+        *augmentation_steps(config),
+        *scene_turn_steps(config),
+        *hand_frame_steps(config, state_statistics),
+    ]
     pre.steps = [*steps[: place + 1], *made, *steps[place + 1 :]]
 
 

@@ -10,7 +10,7 @@ from huggingface_hub import ModelCard, ModelCardData
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, OBS_STATE, PRETRAINED_MODEL_DIR
 
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBS_POINT_CLOUD, POINT_CLOUD
 from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.point_clouds.recipe import CloudRecipe
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
@@ -194,6 +194,8 @@ def _commands(config: PointCloudPolicyConfig, cfg: TrainPipelineConfig | None) -
     path = config.repo_id or "user/name"
     env = cfg.env if cfg is not None else None
     environment = f"--env.type={env.type} --env.task={env.task}" if env is not None else "--env.type=..."
+    if config.observation != POINT_CLOUD:
+        environment += f" --env.observation={config.observation}"
     return (
         "## Commands\n\n```bash\npip install lerobot_policy_uca_flow\n"
         f"lerobot-eval --policy.path={path} {environment} --eval.n_episodes=50\n"

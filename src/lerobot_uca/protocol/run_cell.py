@@ -131,11 +131,12 @@ def _evaluate_checkpoint(folder: RunFolder, cell: Cell, dataset: Path, step: int
 
 
 def make_env(cell: Cell, plan: "PolicyPlan") -> Callable[[], "PointCloudEnv"]:
-    """Makes the cell's environment, with no more points than the policy looks at: the first ones are the same."""
+    """Makes the cell's environment as the policy knows it, with no more points than it looks at: the first ones."""
     from lerobot.envs.configs import EnvConfig
 
     config: Any = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
     config.n_points = plan.config.n_points or config.n_points
+    config.observation = plan.config.observation
     return config.env_factory(cell.env_task)
 
 

@@ -9,6 +9,7 @@ from typing import Any, Self
 import yaml
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBJECT_CLOUD, POINT_CLOUD
 from lerobot_uca.protocol.cells import ENVIRONMENTS, POLICIES, SUITES, Cell
 
 FOLDER = files("lerobot_uca.protocol") / "settings"
@@ -52,6 +53,8 @@ class Setting:
     """The probability of pushes by benchmark, as for lerobot-uca-collect."""
     successful_steps: Mapping[str, int] = field(default_factory=dict)
     """Successful steps after which a demonstration ends, by benchmark, as for lerobot-uca-collect."""
+    observation: Mapping[str, str] = field(default_factory=dict)
+    """The environments' observation by benchmark, point_cloud or object_cloud, the former by default."""
     interim_episodes: int = 20
     """Episodes of each evaluation during training."""
     final_episodes: int = 100
@@ -119,7 +122,7 @@ class Setting:
                     )
 
     def _check_mappings(self) -> None:
-        names = ("smoothing", "pushes", "successful_steps", "policy", "benchmarks", "policies")
+        names = ("smoothing", "pushes", "successful_steps", "observation", "policy", "benchmarks", "policies")
         values = {name: getattr(self, name) for name in names}
         for outer in ("benchmarks", "policies"):
             if isinstance(values[outer], Mapping):
@@ -146,6 +149,12 @@ class Setting:
                 raise UserError(
                     f"Setting '{self.name}': successful_steps holds whole numbers above 0 by benchmark "
                     f"({', '.join(ENVIRONMENTS)}), got {benchmark}: {n_steps!r}."
+                )
+        for benchmark, observation in self.observation.items():
+            if benchmark not in ENVIRONMENTS or observation not in (POINT_CLOUD, OBJECT_CLOUD):
+                raise UserError(
+                    f"Setting '{self.name}': observation holds {POINT_CLOUD} or {OBJECT_CLOUD} by benchmark "
+                    f"({', '.join(ENVIRONMENTS)}), got {benchmark}: {observation!r}."
                 )
 
     def as_values(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
+from lerobot_uca.features import POINT_CLOUD
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import CellFolder, RunFolder
 from lerobot_uca.protocol.setting import Setting
@@ -36,6 +37,7 @@ def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
             options = {
                 "env.type": cell.env_type,
                 "env.task": cell.env_task,
+                "env.observation": folder.setting.observation.get(cell.benchmark, POINT_CLOUD),
                 "repo_id": repo_id(cell),
                 "root": dataset,
                 "n_episodes": folder.setting.demonstrations,

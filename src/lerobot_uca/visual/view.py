@@ -23,6 +23,7 @@ from lerobot_uca.data.sources.find import find_source
 from lerobot_uca.data.sources.lerobot_source import LeRobotSource
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.errors import UserError
+from lerobot_uca.features import POINT_CLOUD
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import optional_crop
@@ -89,13 +90,7 @@ def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
     if config.camera is not None:
         yield from live_clouds(config.camera, config.camera_name, config.calibration, WIDE, MAX_POINTS)
     if config.env is not None:
-        if not isinstance(config.env, PointCloudEnvConfig):
-            raise UserError(f"Only point-cloud environments can be viewed, got env.type={config.env.type}.")
-        config.env.observation = "point_cloud"
-        config.env.validate()
-        (task, *_) = next(iter(config.env.tasks().values()))
-        env = config.env.env_factory(task)()
-        yield env.reset(seed=config.episode)[0]["point_cloud"]
+        yield _first_cloud(config.env, config.episode)
         return
     assert config.source is not None
     try:
@@ -108,6 +103,17 @@ def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
         raise UserError(f"episode must be from 0 to {source.n_episodes - 1}, got {config.episode}.")
     for frame in source.frames(config.episode):
         yield frame.points
+
+
+def _first_cloud(env_config: EnvConfig, seed: int) -> NDArray[np.float32]:
+    if not isinstance(env_config, PointCloudEnvConfig):
+        raise UserError(f"Only point-cloud environments can be viewed, got env.type={env_config.type}.")
+    if env_config.observation == "depth":
+        env_config.observation = POINT_CLOUD
+    env_config.validate()
+    (task, *_) = next(iter(env_config.tasks().values()))
+    env = env_config.env_factory(task)()
+    return env.reset(seed=seed)[0]["point_cloud"]
 
 
 def crop_of(config: ViewConfig, points: NDArray[np.float32]) -> Crop:
