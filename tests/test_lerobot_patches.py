@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from lerobot.configs.default import DatasetConfig
+from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -22,10 +23,12 @@ from lerobot.scripts import lerobot_eval
 from lerobot_uca import configs, lerobot_patches
 from lerobot_uca.data import batched_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
+from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
-from tests.builders import N_ACTIONS, N_POINTS, N_STATES
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
 
 
 def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -230,6 +233,19 @@ def test_an_output_folder_that_cannot_be_made_is_refused(dataset_root, tmp_path)
     with pytest.raises(UserError, match="file' is not a writable folder"):
         training(dataset_root, tmp_path / "file").validate()
     training(dataset_root, tmp_path / "file", ACTConfig).validate()  # LeRobot's own policies find out as before
+
+
+def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path):
+    """By lerobot-eval, and by a training that evaluates on the way."""
+    clouds, objects = (MetaworldPointCloudConfig(observation=name) for name in ("point_cloud", "object_cloud"))
+    UCAFlowPolicy(make_config(observation="object_cloud")).save_pretrained(tmp_path / "policy")
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path / 'policy'}"])
+    assert EvalPipelineConfig(env=objects, output_dir=tmp_path / "eval").policy.observation == "object_cloud"
+    with pytest.raises(UserError, match=r"environment gives point_cloud: add --env.observation=object_cloud"):
+        EvalPipelineConfig(env=clouds, output_dir=tmp_path / "eval")
+    factory.make_train_eval_datasets(training(dataset_root, tmp_path, env=clouds))
+    with pytest.raises(UserError, match=r"environment gives object_cloud: add --env.observation=point_cloud"):
+        factory.make_train_eval_datasets(training(dataset_root, tmp_path, env=objects))
 
 
 def test_the_settings_of_a_training_are_saved_as_they_were_used(monkeypatch, dataset_root, tmp_path):

@@ -12,6 +12,7 @@ from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env_config
+from tests.builders import make_config
 
 from lerobot_uca.data import collect as collecting
 from lerobot_uca.data.collect import CollectConfig, collect
@@ -20,7 +21,7 @@ from lerobot_uca.envs.adroit import HAND
 from lerobot_uca.envs.configs import AdroitPointCloudConfig, MetaworldPointCloudConfig
 from lerobot_uca.envs.experts.expert import pushed
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe
 
 
@@ -124,6 +125,30 @@ def test_depth_images_make_the_clouds_of_the_same_episode(collected, tmp_path):
         np.testing.assert_array_equal(frame["action"], collected[index]["action"])
         points = make.points([frame[key].numpy()])
         assert np.linalg.norm(points[None] - cloud[:, None], axis=-1).min(axis=1).max() < 0.002
+
+
+def test_clouds_without_the_robot_are_told_from_others(collected, tmp_path):
+    env = MetaworldPointCloudConfig(task="drawer-close", n_points=16, observation="object_cloud")
+    objects = collect(config(tmp_path / "objects", env=env))
+    assert cloud_observation(objects.features) == "object_cloud"
+    assert cloud_observation(collected.features) == "point_cloud"
+    assert env.recipe() is None  # depth images show the robot
+    assert (objects[0][OBS_POINT_CLOUD] != collected[0][OBS_POINT_CLOUD]).any()
+    assert torch.equal(objects[0]["action"], collected[0]["action"])
+    policy = make_config()
+    for dataset, other in ((objects, "point_cloud"), (collected, "object_cloud"), (objects, "point_cloud")):
+        policy.set_dataset_feature_metadata(dataset.features)
+        trained = policy.observation
+        assert trained != other
+        policy.check_environment(None)
+        policy.check_environment(MetaworldPointCloudConfig(observation=trained))
+        message = f"training has clouds of env.observation={trained}, .* gives {other}: add --env.observation={trained}"
+        with pytest.raises(UserError, match=message):
+            policy.check_environment(MetaworldPointCloudConfig(observation=other))
+    with pytest.raises(UserError, match="gives point_cloud"):  # another package's, which knows no such option
+        policy.check_environment(object())
+    policy.set_dataset_feature_metadata(collected.features)
+    policy.check_environment(MetaworldPointCloudConfig(observation="depth"))
 
 
 def test_nothing_but_the_dataset_is_left(collected):

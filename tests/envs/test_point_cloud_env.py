@@ -85,6 +85,53 @@ def test_tasks_in_threads_would_share_the_policys_memory(kind):
             start()
 
 
+# The robot left out ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "task"),
+    [
+        *(("metaworld_pointcloud", task) for task in ("reach", "push", "hand-insert", "stick-pull", "coffee-pull")),
+        *(("adroit_pointcloud", task) for task in ("hammer", "pen")),
+    ],
+)
+def test_an_object_cloud_is_what_the_camera_sees_without_the_robot(kind, task):
+    whole = make_env_config(kind, task=task).env_factory(task)()
+    env = make_env_config(kind, task=task, observation="object_cloud").env_factory(task)()
+    whole.reset(seed=5)
+    cloud = env.reset(seed=5)[0]["point_cloud"].astype(np.float64)
+    assert cloud.shape == env.observation_space["point_cloud"].shape
+    model, data, markers = whole._simulator.model, whole._simulator.data, whole._markers()
+    camera = whole.observer.camera
+    hits = camera._caster.cast(model, data)
+    rays = camera._caster.rays
+    is_of_robot = [hangs_on(model, body, env.robot) for body in model.geom_bodyid]
+    is_robot = np.append(is_of_robot, False)[hits.geom]
+    robot = rays.origin + rays.directions[is_robot] * hits.distance[is_robot, None]
+    robot = robot[camera.crop.contains(robot)]
+    everything = camera.capture(model, data, markers)
+    rest = everything[distances(everything, robot) > 1e-6]
+    assert min(len(robot), len(rest)) > 20
+    assert distances(cloud, rest).max() < 1e-6  # float32
+    assert distances(rest, cloud).max() < 0.03  # no part is missing
+
+
+def hangs_on(model, body: int, root: str) -> bool:
+    while body and model.body(body).name != root:
+        body = model.body_parentid[body]
+    return bool(body)
+
+
+def test_where_the_robot_hides_everything_the_cloud_is_the_robots():
+    env = make_env_config("metaworld_pointcloud", task="reach", observation="object_cloud").env_factory("reach")()
+    env.reset(seed=0)
+    camera = env.observer.camera
+    whole = camera.capture(env._simulator.model, env._simulator.data)
+    env.observer._objects._is_left_out = lambda model: np.append(np.ones(model.ngeom, bool), False)
+    env._markers = tuple
+    assert distances(env.observe()["point_cloud"].astype(np.float64), whole).max() < 1e-6
+
+
 # Depth --------------------------------------------------------------------------------------------------------------
 
 
@@ -146,9 +193,7 @@ def test_depth_is_of_one_camera_and_one_crop():
     config = depth_config("metaworld_pointcloud", "drawer-close,hand-insert")
     with pytest.raises(UserError, match="depth needs tasks of one camera and one crop, got 2 in"):
         config.validate()
-    with pytest.raises(
-        UserError, match=r"env\.observation must be one of point_cloud, object_cloud, depth, got"
-    ):
+    with pytest.raises(UserError, match=r"env\.observation must be one of point_cloud, object_cloud, depth, got"):
         make_env_config("metaworld_pointcloud", task="reach", observation="colour").validate()
     assert make_env_config("metaworld_pointcloud", task="drawer-close,reach").recipe() is not None
 

@@ -42,6 +42,19 @@ MOVING_SCENE = """
   </worldbody>
 </mujoco>
 """
+ARM_SCENE = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="2 2 0.1"/>
+    <body name="thing" pos="0.5 0 0.1"><geom type="box" size="0.1 0.1 0.1"/></body>
+    <body name="arm" pos="-0.4 0 0.5">
+      <geom type="sphere" size="0.1"/>
+      <body pos="0.4 0 0"><geom type="sphere" size="0.2"/></body>
+    </body>
+    <body name="last" pos="0 0.5 0.1"><geom type="box" size="0.1 0.1 0.1"/></body>
+  </worldbody>
+</mujoco>
+"""
 LOOKING_DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 CAMERA = Camera.from_fovy("top", (0.0, 0.0, 2.0), LOOKING_DOWN, 60.0, (40, 40))
 EVERYTHING = Crop((-9, -9, -9), (9, 9, 9))
@@ -106,6 +119,29 @@ def test_markers_are_seen_and_hidden_like_solid_spheres(scene):
     moved = np.abs(changed - plain).max(axis=1) > 0
     assert moved.any()
     np.testing.assert_allclose(np.linalg.norm(changed[moved] - above.centre, axis=1), 0.1, atol=1e-9)
+
+
+def test_a_body_that_is_left_out_hides_what_is_behind_it_but_gives_no_points():
+    model = mujoco.MjModel.from_xml_string(ARM_SCENE)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    whole, without = PointCloudCamera(CAMERA, EVERYTHING), PointCloudCamera(CAMERA, EVERYTHING, left_out="arm")
+    points = whole.capture(model, data)
+    is_arm = np.zeros(len(points), bool)
+    for centre, radius in (([-0.4, 0, 0.5], 0.1), ([0, 0, 0.5], 0.2)):
+        is_arm |= np.abs(np.linalg.norm(points - centre, axis=1) - radius) < 1e-6
+    assert 10 < is_arm.sum() < len(points) - 100
+    np.testing.assert_array_equal(without.capture(model, data), points[~is_arm])
+    over = Marker(np.array([0, 0, 1.0]), 0.1, np.ones(3))
+    under = Marker(np.array([0, 0, 0.1]), 0.1, np.ones(3))
+    seen = without.capture(model, data, [over, under])
+    distance = {marker: np.abs(np.linalg.norm(seen - [0, 0, marker], axis=1) - 0.1) for marker in (1.0, 0.1)}
+    assert (distance[1.0] < 1e-6).sum() > 3
+    assert not (distance[0.1] < 1e-6).any()
+    again = mujoco.MjModel.from_xml_string(ARM_SCENE.replace('name="arm"', 'name="x"').replace('"last"', '"arm"'))
+    data = mujoco.MjData(again)
+    mujoco.mj_forward(again, data)
+    assert len(without.capture(again, data)) > (~is_arm).sum()  # of another model it is another body
 
 
 def test_a_depth_picture_holds_the_points_that_the_cloud_camera_sees(scene):

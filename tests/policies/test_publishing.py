@@ -30,6 +30,13 @@ def test_clouds_from_depth_have_their_cameras_calibrations_and_crop(published):
     assert row in text
 
 
+def test_the_evaluations_command_names_clouds_without_the_robot(published):
+    command = "lerobot-eval --policy.path=user/name --env.type=..."
+    assert f"{command} --eval.n_episodes=50" in card(published)
+    published.config.observation = "object_cloud"
+    assert f"{command} --env.observation=object_cloud --eval.n_episodes=50" in card(published)
+
+
 def test_a_known_evaluation_has_its_episodes_and_seeds(published):
     assert "not evaluated" in card(published)
     published.evaluation = Evaluation(84.0, 50, 1000)

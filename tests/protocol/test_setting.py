@@ -79,6 +79,12 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
             "whole numbers above 0 by benchmark (adroit, metaworld), got metaworld: 0",
         ),
         ({**GOOD, "successful_steps": {"libero": 5}}, "by benchmark (adroit, metaworld), got libero: 5"),
+        ({**GOOD, "observation": "object_cloud"}, "observation must hold values by name, got 'object_cloud'"),
+        (
+            {**GOOD, "observation": {"metaworld": "depth"}},
+            "point_cloud or object_cloud by benchmark (adroit, metaworld)",
+        ),
+        ({**GOOD, "observation": {"libero": "point_cloud"}}, "(adroit, metaworld), got libero: 'point_cloud'"),
         (
             {**GOOD, "benchmarks": {"libero": {}}},
             "benchmarks holds options by benchmark (adroit, metaworld), got 'libero'",

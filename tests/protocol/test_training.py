@@ -62,6 +62,7 @@ def test_demonstrations_are_made_as_the_setting_says(tmp_path, monkeypatch):
         "smoothing": {"metaworld/reach": 0.5},
         "pushes": {"metaworld": 0.1},
         "successful_steps": {"metaworld": 7},
+        "observation": {"metaworld": "object_cloud"},
     }
     folder = RunFolder.create(tmp_path / "run", Setting.from_values("tiny", {**values, **disturbed}))
     called = []
@@ -70,7 +71,7 @@ def test_demonstrations_are_made_as_the_setting_says(tmp_path, monkeypatch):
     ((command, arguments),) = called
     assert command == "lerobot-uca-collect"
     expected = {"--env.task=reach", "--n_episodes=10", "--smoothing=0.5", "--pushes=0.1", "--successful_steps=7"}
-    assert expected <= set(arguments)
+    assert {*expected, "--env.observation=object_cloud"} <= set(arguments)
 
 
 def test_a_cell_without_space_stops_the_run_and_stays_open(folder, monkeypatch):
