@@ -28,6 +28,8 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.setting import Setting
 from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
 
 
@@ -270,3 +272,15 @@ def test_a_configuration_holds_only_what_lerobot_reads(path):
     settings = yaml.safe_load(path.read_text())
     assert config.steps == settings["steps"]
     assert config.policy.type == settings["policy"]["type"]
+
+
+def test_metaworlds_configuration_is_the_benchmarks_setting():
+    """Besides the engine: the benchmark computes by PyTorch."""
+    settings = yaml.safe_load((configs.FOLDER / "uca_flow_metaworld.yaml").read_text())
+    setting = Setting.load("small")
+    options = setting.policy_options(Cell("metaworld/reach", "uca_flow", 0))
+    turn = {f"scene_turn.{key}": value for key, value in settings["policy"]["scene_turn"].items()}
+    policy = {**settings["policy"], **turn}
+    assert {key: value for key, value in policy.items() if key in options} == options
+    assert policy.keys() - options.keys() == {"push_to_hub", "inference", "scene_turn"}
+    assert (settings["batch_size"], settings["steps"]) == (setting.batch_size, setting.lengths["metaworld"].steps)
