@@ -13,9 +13,11 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env_config
 from tests.builders import make_config
+from tests.depth_builders import make_recipe
 
 from lerobot_uca.data import collect as collecting
 from lerobot_uca.data.collect import CollectConfig, collect
+from lerobot_uca.data.convert import ConvertConfig, convert
 from lerobot_uca.data.demonstrations import Demonstration, demonstrate
 from lerobot_uca.envs.adroit import HAND
 from lerobot_uca.envs.configs import AdroitPointCloudConfig, MetaworldPointCloudConfig
@@ -23,6 +25,7 @@ from lerobot_uca.envs.experts.expert import pushed
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe
+from lerobot_uca.policies.depth_config import DepthConfig
 
 
 def config(root, **changes):
@@ -133,9 +136,13 @@ def test_clouds_without_the_robot_are_told_from_others(collected, tmp_path):
     assert cloud_observation(objects.features) == "object_cloud"
     assert cloud_observation(collected.features) == "point_cloud"
     assert env.recipe() is None  # depth images show the robot
+    again = convert(ConvertConfig(source=objects.root, repo_id="test/again", root=tmp_path / "again", n_points=8))
+    assert cloud_observation(again.features) == "object_cloud"
     assert (objects[0][OBS_POINT_CLOUD] != collected[0][OBS_POINT_CLOUD]).any()
     assert torch.equal(objects[0]["action"], collected[0]["action"])
-    policy = make_config()
+    policy = make_config(depth=DepthConfig(recipe=make_recipe().as_dict()))
+    policy.set_dataset_feature_metadata(objects.features)
+    assert policy.depth.recipe is None  # of a checkpoint that has seen clouds with the robot
     for dataset, other in ((objects, "point_cloud"), (collected, "object_cloud"), (objects, "point_cloud")):
         policy.set_dataset_feature_metadata(dataset.features)
         trained = policy.observation

@@ -174,6 +174,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             UserError: if depth images lack a calibration or a crop, or do not fit the checkpoint to be trained further.
         """
         self.observation = cloud_observation(features)
+        if self.observation == OBJECT_CLOUD:
+            self.depth.recipe = None  # a checkpoint's, for clouds with the robot
         knows_clouds = self.depth.recipe is not None
         recipe = self.depth.settle(features)
         cloud_key = find_point_cloud(features)

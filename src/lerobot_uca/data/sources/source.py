@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.features import POINT_CLOUD
 from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import CloudRecipe
 
@@ -67,6 +68,11 @@ class Source(ABC):
     def recipe(self) -> CloudRecipe | None:
         """The recipe by which clouds are made from depth images, if they are."""
         return None
+
+    @property
+    def observation(self) -> str:
+        """Which of the environments' observations the clouds are: with the robot in them, if nothing else is known."""
+        return POINT_CLOUD
 
     def names(self, _: str) -> list[str] | None:
         """The names of a feature's numbers, if the source knows them."""
