@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from lerobot.configs.default import DatasetConfig
+from lerobot.configs.default import DatasetConfig, EvalConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
@@ -237,7 +237,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused(dataset_root, tmp_path)
     training(dataset_root, tmp_path / "file", ACTConfig).validate()  # LeRobot's own policies find out as before
 
 
-def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path):
+def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path, caplog):
     """By lerobot-eval, and by a training that evaluates on the way."""
     clouds, objects = (MetaworldPointCloudConfig(observation=name) for name in ("point_cloud", "object_cloud"))
     UCAFlowPolicy(make_config(observation="object_cloud")).save_pretrained(tmp_path / "policy")
@@ -245,6 +245,9 @@ def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch
     assert EvalPipelineConfig(env=objects, output_dir=tmp_path / "eval").policy.observation == "object_cloud"
     with pytest.raises(UserError, match=r"environment gives point_cloud: add --env.observation=object_cloud"):
         EvalPipelineConfig(env=clouds, output_dir=tmp_path / "eval")
+    assert "does not say that its clouds are without the robot" not in caplog.text
+    EvalPipelineConfig(env=objects, output_dir=tmp_path / "eval", eval=EvalConfig(recording=True))
+    assert "does not say that its clouds are without the robot" in caplog.text
     factory.make_train_eval_datasets(training(dataset_root, tmp_path, env=clouds))
     with pytest.raises(UserError, match=r"environment gives object_cloud: add --env.observation=point_cloud"):
         factory.make_train_eval_datasets(training(dataset_root, tmp_path, env=objects))

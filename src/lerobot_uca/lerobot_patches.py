@@ -34,7 +34,7 @@ from lerobot_uca.checkpoints.steps import check_steps
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
 from lerobot_uca.errors import UserError, reported
-from lerobot_uca.features import ENV_NAMES, cloud_observation, find_point_cloud, valid_mask
+from lerobot_uca.features import ENV_NAMES, OBJECT_CLOUD, cloud_observation, find_point_cloud, valid_mask
 from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.lerobot_version import is_supported
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
@@ -293,13 +293,22 @@ def check_settings() -> None:
         def make_and_check(self: EvalPipelineConfig) -> None:
             make(self)
             if isinstance(self.policy, PointCloudPolicyConfig):
-                check_output_folder(self.output_dir)
-                self.policy.check_environment(self.env)
+                _check_evaluation(self, self.policy)
 
         return make_and_check
 
     _replace_method(TrainPipelineConfig, "validate", validated)
     _replace_method(EvalPipelineConfig, "__post_init__", made)
+
+
+def _check_evaluation(config: EvalPipelineConfig, policy: PointCloudPolicyConfig) -> None:
+    check_output_folder(config.output_dir)
+    policy.check_environment(config.env)
+    if config.eval.recording and policy.observation == OBJECT_CLOUD:
+        logger.warning(
+            "The recorded dataset does not say that its clouds are without the robot: nothing will check that what is "
+            "trained on it is evaluated with --env.observation=object_cloud."
+        )
 
 
 def check_output_folder(output_dir: Path | str | None) -> None:
