@@ -104,6 +104,7 @@ def _run_part(args: argparse.Namespace, seeds: range) -> Timed:
     plan = PolicyPlan.from_checkpoint(args.checkpoint)
     env_config: Any = EnvConfig.get_choice_class(args.env)(task=args.task)
     env_config.n_points = plan.config.n_points or env_config.n_points
+    env_config.observation = plan.config.observation
     episodes = run_episodes(env_config.env_factory(args.task), plan.config, plan, seeds, n_envs=10)
     successes = {episode.seed: episode.success for episode in episodes}
     seconds = time.perf_counter() - begin

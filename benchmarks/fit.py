@@ -46,8 +46,8 @@ def main() -> None:
     dataset = BatchedDataset(f"local/{args.dataset.name}", root=args.dataset, delta_timestamps=seconds)
     preprocess, _ = make_pre_post_processors(config, pretrained_path=str(args.checkpoint))
     raw = default_collate(dataset.__getitems__(list(range(len(dataset)))))
-    batch = preprocess(raw)
-    with torch.no_grad():
+    with torch.no_grad():  # with gradients the preprocessor would change the clouds as in training
+        batch = preprocess(raw)
         made = policy.predict_action_chunk({key: batch[key] for key in (OBS_POINT_CLOUD, "observation.state")})
     expert, padded = batch["action"], raw["action_is_pad"]
     error = made - expert[:, config.executed]

@@ -52,6 +52,7 @@ def evaluate(checkpoint: Path, env_config: Any, seeds: range, n_videos: int) -> 
     begin = time.perf_counter()
     config: Any = PreTrainedConfig.from_pretrained(checkpoint)
     config.inference = "eager"
+    env_config.observation = config.observation
     policy_class: Any = get_policy_class(config.type)
     policy = policy_class.from_pretrained(checkpoint, config=config).eval()
     draw_by_episode(policy, seeds)

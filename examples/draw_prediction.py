@@ -44,7 +44,7 @@ def main() -> None:
 
     policy = UCAFlowPolicy.from_pretrained(args.checkpoint)
     preprocess, postprocess = make_pre_post_processors(policy.config, pretrained_path=str(args.checkpoint))
-    env = MetaworldPointCloudEnv(args.task)
+    env = MetaworldPointCloudEnv(args.task, observation=policy.config.observation)
     torch.manual_seed(args.seed)
 
     mpl.use("Agg")

@@ -7,12 +7,13 @@ import os
 import pkgutil
 import subprocess
 import sys
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from lerobot.configs.default import DatasetConfig, EvalConfig
+from lerobot.configs.default import DatasetConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
@@ -25,7 +26,7 @@ from lerobot_uca.data import batched_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from lerobot_uca.protocol.cells import Cell
@@ -237,17 +238,17 @@ def test_an_output_folder_that_cannot_be_made_is_refused(dataset_root, tmp_path)
     training(dataset_root, tmp_path / "file", ACTConfig).validate()  # LeRobot's own policies find out as before
 
 
-def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path, caplog):
-    """By lerobot-eval, and by a training that evaluates on the way."""
+def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path):
+    """By lerobot-eval, whose recordings say what they are, and by a training that evaluates on the way."""
+    monkeypatch.setattr(lerobot_patches, "_evaluated", ContextVar("evaluated", default="point_cloud"))
     clouds, objects = (MetaworldPointCloudConfig(observation=name) for name in ("point_cloud", "object_cloud"))
     UCAFlowPolicy(make_config(observation="object_cloud")).save_pretrained(tmp_path / "policy")
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path / 'policy'}"])
     assert EvalPipelineConfig(env=objects, output_dir=tmp_path / "eval").policy.observation == "object_cloud"
     with pytest.raises(UserError, match=r"environment gives point_cloud: add --env.observation=object_cloud"):
         EvalPipelineConfig(env=clouds, output_dir=tmp_path / "eval")
-    assert "does not say that its clouds are without the robot" not in caplog.text
-    EvalPipelineConfig(env=objects, output_dir=tmp_path / "eval", eval=EvalConfig(recording=True))
-    assert "does not say that its clouds are without the robot" in caplog.text
+    recorded = lerobot_eval._env_features_to_dataset_features(objects.features)
+    assert cloud_observation(recorded) == "object_cloud"
     factory.make_train_eval_datasets(training(dataset_root, tmp_path, env=clouds))
     with pytest.raises(UserError, match=r"environment gives object_cloud: add --env.observation=point_cloud"):
         factory.make_train_eval_datasets(training(dataset_root, tmp_path, env=objects))

@@ -34,7 +34,16 @@ from lerobot_uca.checkpoints.steps import check_steps
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
 from lerobot_uca.errors import UserError, reported
-from lerobot_uca.features import ENV_NAMES, OBJECT_CLOUD, cloud_observation, find_point_cloud, valid_mask
+from lerobot_uca.features import (
+    ENV_NAMES,
+    OBJECT_CLOUD,
+    OBS_POINT_CLOUD,
+    OBSERVATION_INFO,
+    POINT_CLOUD,
+    cloud_observation,
+    find_point_cloud,
+    valid_mask,
+)
 from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.lerobot_version import is_supported
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
@@ -304,11 +313,7 @@ def check_settings() -> None:
 def _check_evaluation(config: EvalPipelineConfig, policy: PointCloudPolicyConfig) -> None:
     check_output_folder(config.output_dir)
     policy.check_environment(config.env)
-    if config.eval.recording and policy.observation == OBJECT_CLOUD:
-        logger.warning(
-            "The recorded dataset does not say that its clouds are without the robot: nothing will check that what is "
-            "trained on it is evaluated with --env.observation=object_cloud."
-        )
+    _evaluated.set(policy.observation)
 
 
 def check_output_folder(output_dir: Path | str | None) -> None:
@@ -367,7 +372,7 @@ def normalise_what_is_trained() -> None:
         def make_train_eval_datasets(config: TrainPipelineConfig) -> Any:
             datasets = make(config)
             if isinstance(config.policy, PointCloudPolicyConfig):
-                config.policy.check_environment(config.env, cloud_observation(datasets[0].meta.features))
+                config.policy.check_environment(config.env, _observation_of(config, datasets[0]))
                 for dataset in filter(None, datasets):
                     _normalise_by_chosen_episodes(config.policy, dataset, config.rename_map)
             return datasets
@@ -375,6 +380,11 @@ def normalise_what_is_trained() -> None:
         return make_train_eval_datasets
 
     _replace(factory.make_train_eval_datasets, checked)
+
+
+def _observation_of(config: TrainPipelineConfig, dataset: Any) -> str:
+    features = dataset.meta.features.items()
+    return cloud_observation({config.rename_map.get(key, key): feature for key, feature in features})
 
 
 def _normalise_by_chosen_episodes(policy: PointCloudPolicyConfig, dataset: Any, rename_map: dict[str, str]) -> None:
@@ -406,17 +416,22 @@ def _sample_clouds(step: PointCloudProcessorStep, dataset: BatchedDataset, key: 
     columns.tensors[key] = torch.stack(sampled)
 
 
+_evaluated: ContextVar[str] = ContextVar("evaluated", default=POINT_CLOUD)
+"""The observation of the policy that this process evaluates."""
+
+
 def record_what_can_be_trained() -> None:
     """`lerobot-eval --eval.recording=true` names features as policies do. LeRobot takes the environment's names.
 
-    With those (point_cloud, agent_pos) nothing can be trained, and nothing renames them.
+    With those (point_cloud, agent_pos) nothing can be trained, and nothing renames them. Nor would the dataset say that
+    its clouds are without the robot.
     """
     evaluation = next((sys.modules[name] for name in EVALUATION_MODULES if name in sys.modules), None)
     if evaluation is None or not hasattr(evaluation, "_build_raw_frame"):  # no evaluation in this process
         return
 
     def features(make: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda env_features: _renamed(make(env_features))
+        return lambda env_features: _labelled(_renamed(make(env_features)))
 
     def frame(build: Callable[..., Any]) -> Callable[..., Any]:
         return lambda raw_obs, *args, **kwargs: build(_renamed(raw_obs), *args, **kwargs)
@@ -429,6 +444,12 @@ def _renamed(values: dict[str, Any]) -> dict[str, Any]:
     """Observations or features of this package's environments under the policies' names; others' as they are."""
     is_ours = values.keys() >= ENV_NAMES.keys()
     return {ENV_NAMES.get(key, key) if is_ours else key: value for key, value in values.items()}
+
+
+def _labelled(features: dict[str, Any]) -> dict[str, Any]:
+    if _evaluated.get() == OBJECT_CLOUD and OBS_POINT_CLOUD in features:
+        features[OBS_POINT_CLOUD]["info"] = {OBSERVATION_INFO: OBJECT_CLOUD}
+    return features
 
 
 def _read_without_workers(config: TrainPipelineConfig, dataset: Any) -> None:

@@ -12,7 +12,8 @@ from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import make_env_config
-from tests.builders import make_config
+from lerobot.policies import make_pre_post_processors
+from tests.builders import make_config, make_statistics
 from tests.depth_builders import make_recipe
 
 from lerobot_uca.data import collect as collecting
@@ -26,6 +27,9 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe
 from lerobot_uca.policies.depth_config import DepthConfig
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from lerobot_uca.policies.processor_base import make_processors
+from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
 
 
 def config(root, **changes):
@@ -143,6 +147,14 @@ def test_clouds_without_the_robot_are_told_from_others(collected, tmp_path):
     policy = make_config(depth=DepthConfig(recipe=make_recipe().as_dict()))
     policy.set_dataset_feature_metadata(objects.features)
     assert policy.depth.recipe is None  # of a checkpoint that has seen clouds with the robot
+    policy.set_dataset_feature_metadata({"other.cloud": collected.features[OBS_POINT_CLOUD]})
+    assert policy.observation == "object_cloud"  # not yet renamed
+    UCAFlowPolicy(policy).save_pretrained(tmp_path / "policy")
+    with_recipe = make_config(depth=DepthConfig(recipe=make_recipe().as_dict()))
+    for processors in make_processors(with_recipe, make_statistics()):
+        processors.save_pretrained(tmp_path / "policy")
+    preprocess, _ = make_pre_post_processors(policy, pretrained_path=str(tmp_path / "policy"))
+    assert [step.recipe for step in preprocess.steps if isinstance(step, DepthToCloudProcessorStep)] == [None]
     for dataset, other in ((objects, "point_cloud"), (collected, "object_cloud"), (objects, "point_cloud")):
         policy.set_dataset_feature_metadata(dataset.features)
         trained = policy.observation
@@ -152,7 +164,7 @@ def test_clouds_without_the_robot_are_told_from_others(collected, tmp_path):
         message = f"training has clouds of env.observation={trained}, .* gives {other}: add --env.observation={trained}"
         with pytest.raises(UserError, match=message):
             policy.check_environment(MetaworldPointCloudConfig(observation=other))
-    with pytest.raises(UserError, match="gives point_cloud"):  # another package's, which knows no such option
+    with pytest.raises(UserError, match="gives point_cloud: it has no other"):  # another package's
         policy.check_environment(object())
     policy.set_dataset_feature_metadata(collected.features)
     policy.check_environment(MetaworldPointCloudConfig(observation="depth"))

@@ -159,12 +159,22 @@ def test_a_checkpoint_keeps_it_and_a_training_from_it_may_change_it(tmp_path):
         ({"states": (0, 1, 3)}, r"policy.scene_turn.states must be pairs .*got \[0, 1, 3\]"),
         ({"states": (0, 9)}, r"policy.scene_turn.states must be pairs .*got \[0, 9\]"),
         ({"actions": (1, 1)}, r"policy.scene_turn.actions must be pairs .*0 to 3, .*got \[1, 1\]"),
+        ({"states": (3, 4)}, r"states must hold the hand's x and y, \[0, 1\] of policy.hand_position, .* got \[3, 4\]"),
+        ({"states": (1, 0)}, r"states must hold the hand's x and y, \[0, 1\] of policy.hand_position, .* got \[1, 0\]"),
         ({"actions": ()}, r"policy.scene_turn.actions must be pairs .*got \(\)"),
     ],
 )
 def test_wrong_values(wrong, message):
     with pytest.raises(UserError, match=message):
         turning(**wrong).validate_features()
+
+
+def test_a_single_frame_is_no_training_and_stays():
+    transition = {
+        TransitionKey.OBSERVATION: {OBS_POINT_CLOUD: torch.rand(1, 5, 3), "observation.state": torch.zeros(1, 9)},
+        TransitionKey.ACTION: torch.zeros(1, 4),
+    }
+    assert make_step()(transition) is transition
 
 
 def test_it_needs_to_know_the_hand():

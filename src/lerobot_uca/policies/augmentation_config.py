@@ -64,3 +64,9 @@ class SceneTurnConfig:
                     f"policy.scene_turn.{name} must be pairs of different dimensions, 0 to {n - 1}, each x and y, "
                     f"got {pairs and list(pairs)}."
                 )
+        pairs = self.states or ()
+        if tuple(hand_position[:2]) not in [tuple(pairs[first : first + 2]) for first in range(0, len(pairs), 2)]:
+            raise UserError(
+                f"policy.scene_turn.states must hold the hand's x and y, {list(hand_position[:2])} of "
+                f"policy.hand_position, as a pair, got {list(pairs)}."
+            )

@@ -1,5 +1,6 @@
 """Configuration shared by the point-cloud policies: observations, horizons, encoder, training recipe."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,9 +13,12 @@ from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, POINT_CLOUD, cloud_observation, find_point_cloud
 from lerobot_uca.inference.backends import BACKENDS
+from lerobot_uca.point_clouds.recipe import depth_keys
 from lerobot_uca.policies.augmentation_config import AugmentationConfig, SceneTurnConfig
 from lerobot_uca.policies.depth_config import DepthConfig
 from lerobot_uca.policies.optimizer import FusedAdamWConfig
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -173,7 +177,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         Raises:
             UserError: if depth images lack a calibration or a crop, or do not fit the checkpoint to be trained further.
         """
-        self.observation = cloud_observation(features)
+        self._take_observation(features)
         if self.observation == OBJECT_CLOUD:
             self.depth.recipe = None  # a checkpoint's, for clouds with the robot
         knows_clouds = self.depth.recipe is not None
@@ -193,6 +197,14 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             raise UserError("policy.colour=true needs clouds with colours (N, 6): depth images have none.")
         inputs = {key: feature for key, feature in (self.input_features or {}).items() if key not in recipe.keys}
         self.input_features = {**inputs, OBS_POINT_CLOUD: PolicyFeature(FeatureType.STATE, (recipe.n_points, 3))}
+
+    def _take_observation(self, features: dict[str, Any]) -> None:
+        if find_point_cloud(features) is None and not depth_keys(features):
+            return  # under another name, which a rename_map gives; the features come again with it
+        observation = cloud_observation(features)
+        if self.pretrained_path and observation != self.observation:
+            logger.warning("The checkpoint saw clouds of env.observation=%s, now %s.", self.observation, observation)
+        self.observation = observation
 
     def check_dataset(self, features: Mapping[str, Mapping[str, Any]]) -> None:
         """Raise a `UserError` if a dataset's features, already renamed, cannot continue this checkpoint's training."""
@@ -222,9 +234,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         """
         trained, given = observation or self.observation, getattr(env, "observation", POINT_CLOUD)
         if env is not None and trained != given and OBJECT_CLOUD in (trained, given):
+            mend = f"add --env.observation={trained}" if hasattr(env, "observation") else "it has no other"
             raise UserError(
-                f"The policy's training has clouds of env.observation={trained}, the environment gives {given}: add "
-                f"--env.observation={trained}."
+                f"The policy's training has clouds of env.observation={trained}, the environment gives {given}: {mend}."
             )
 
     @property

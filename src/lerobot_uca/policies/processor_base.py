@@ -24,7 +24,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud, valid_mask
+from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, find_point_cloud, valid_mask
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_augmentation import CloudAugmentationProcessorStep, augmentation_steps
 from lerobot_uca.policies.processor_depth import DepthToCloudProcessorStep
@@ -98,6 +98,8 @@ def load_processors(
     for step in processors[0].steps:
         if isinstance(step, DepthToCloudProcessorStep):
             step.recipe = config.depth.recipe or step.recipe  # a further training's, where that has another one
+            if config.observation == OBJECT_CLOUD:  # depth images show the robot
+                step.recipe = None
             step.install(config.depth.calibration)
     _check_pipelines(config, checkpoint, *processors)
     return processors

@@ -32,9 +32,10 @@ def scene_turn_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
 class SceneTurnProcessorStep(ProcessorStep):
     """Turns a sample's clouds, states and actions as one, in training only.
 
-    The robot that stands at the hand's newest place in a turned scene would move as the demonstration does, turned.
-    The step stands before the normaliser, where lengths are metres. Draws come from PyTorch's generator, which `seed`
-    sets and a checkpoint restores.
+    A robot in the turned scene, its hand at the same place, would move as the demonstration does, turned. What the
+    environment has clipped of the expert's action is turned as it was clipped, and may lie outside [-1, 1]. The step
+    stands before the normaliser, where lengths are metres. Draws come from PyTorch's generator, which `seed` sets and a
+    checkpoint restores.
 
     Args:
         degrees: the largest turn to either side [deg].
@@ -56,6 +57,8 @@ class SceneTurnProcessorStep(ProcessorStep):
         if not is_training or OBS_POINT_CLOUD not in observation or OBS_STATE not in observation:
             return transition
         cloud = observation[OBS_POINT_CLOUD]
+        if cloud.ndim != 4:  # a single frame, whose batch comes later, is not training's
+            return transition
         with independent_draws(cloud.device):
             angle = torch.deg2rad(self.degrees * cloud.new_empty(len(cloud)).uniform_(-1, 1))
         cloud, state, action = self.turned(cloud, observation[OBS_STATE], action, angle)

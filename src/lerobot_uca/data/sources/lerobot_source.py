@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lerobot_uca.data.recorded_calibrations import EXTRINSICS, INTRINSICS, recorded_calibrations
 from lerobot_uca.data.sources.source import ACTION, STATE, Frame, Source
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import VALID_MASK_SUFFIX, cloud_observation, find_point_cloud
+from lerobot_uca.features import POINT_CLOUD, VALID_MASK_SUFFIX, cloud_observation, find_point_cloud
 from lerobot_uca.point_clouds.depth import DepthError, is_valid
 from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe, camera_of, depth_keys, recipe_for
@@ -65,7 +65,7 @@ class LeRobotSource(Source):
     @property
     def observation(self) -> str:
         """As the dataset says; clouds of depth images show the robot."""
-        return cloud_observation(self.features)
+        return cloud_observation(self.features) if self.depth_recipe is None else POINT_CLOUD
 
     def names(self, key: str) -> list[str] | None:
         """The names of a feature's numbers."""
