@@ -34,6 +34,11 @@ def valid_mask(key: str, keys: Iterable[str]) -> str | None:
     return mask if mask in set(keys) else None
 
 
+def observation_info(observation: str) -> dict[str, str]:
+    """What a dataset's cloud says of itself. A point_cloud says nothing, as before there were others."""
+    return {OBSERVATION_INFO: observation} if observation == OBJECT_CLOUD else {}
+
+
 def cloud_observation(features: Mapping[str, Mapping[str, Any]]) -> str:
     """Which of the environments' observations the cloud of a dataset's features is."""
     key = find_point_cloud(features)

@@ -36,12 +36,11 @@ from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
 from lerobot_uca.errors import UserError, reported
 from lerobot_uca.features import (
     ENV_NAMES,
-    OBJECT_CLOUD,
     OBS_POINT_CLOUD,
-    OBSERVATION_INFO,
     POINT_CLOUD,
     cloud_observation,
     find_point_cloud,
+    observation_info,
     valid_mask,
 )
 from lerobot_uca.hub import upload_command, uploading
@@ -372,9 +371,8 @@ def normalise_what_is_trained() -> None:
         def make_train_eval_datasets(config: TrainPipelineConfig) -> Any:
             datasets = make(config)
             if isinstance(config.policy, PointCloudPolicyConfig):
-                config.policy.check_environment(config.env, _observation_of(config, datasets[0]))
                 for dataset in filter(None, datasets):
-                    _normalise_by_chosen_episodes(config.policy, dataset, config.rename_map)
+                    _normalise_by_chosen_episodes(config, config.policy, dataset)
             return datasets
 
         return make_train_eval_datasets
@@ -382,14 +380,10 @@ def normalise_what_is_trained() -> None:
     _replace(factory.make_train_eval_datasets, checked)
 
 
-def _observation_of(config: TrainPipelineConfig, dataset: Any) -> str:
-    features = dataset.meta.features.items()
-    return cloud_observation({config.rename_map.get(key, key): feature for key, feature in features})
-
-
-def _normalise_by_chosen_episodes(policy: PointCloudPolicyConfig, dataset: Any, rename_map: dict[str, str]) -> None:
-    features = dataset.meta.features
+def _normalise_by_chosen_episodes(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:
+    features, rename_map = dataset.meta.features, config.rename_map
     renamed = {rename_map.get(key, key): feature for key, feature in features.items()}
+    policy.check_environment(config.env, cloud_observation(renamed))
     if policy.pretrained_path:
         policy.set_dataset_feature_metadata(renamed)  # LeRobot's own call does not rename
         policy.check_dataset(renamed)
@@ -447,8 +441,8 @@ def _renamed(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _labelled(features: dict[str, Any]) -> dict[str, Any]:
-    if _evaluated.get() == OBJECT_CLOUD and OBS_POINT_CLOUD in features:
-        features[OBS_POINT_CLOUD]["info"] = {OBSERVATION_INFO: OBJECT_CLOUD}
+    if OBS_POINT_CLOUD in features:
+        features[OBS_POINT_CLOUD]["info"] = observation_info(_evaluated.get())
     return features
 
 

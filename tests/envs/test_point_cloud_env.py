@@ -8,6 +8,7 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds import single_rays
+from lerobot_uca.point_clouds.cameras import PointCloudCamera
 from lerobot_uca.point_clouds.geometry import ray_sphere_distances, sample_farthest
 from lerobot_uca.point_clouds.rays import Hits, Rays
 
@@ -126,8 +127,8 @@ def test_where_the_robot_hides_everything_the_cloud_is_the_robots():
     env = make_env_config("metaworld_pointcloud", task="reach", observation="object_cloud").env_factory("reach")()
     env.reset(seed=0)
     camera = env.observer.camera
-    whole = camera.capture(env._simulator.model, env._simulator.data)
-    env.observer._objects._is_left_out = lambda model: np.append(np.ones(model.ngeom, bool), False)
+    whole = PointCloudCamera(camera.camera, camera.crop).capture(env._simulator.model, env._simulator.data)
+    camera._is_left_out = lambda model: np.append(np.ones(model.ngeom, bool), False)
     env._markers = tuple
     assert distances(env.observe()["point_cloud"].astype(np.float64), whole).max() < 1e-6
 

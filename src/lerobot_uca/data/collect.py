@@ -28,7 +28,7 @@ from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt, pushed, smoothed
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, OBSERVATION_INFO
+from lerobot_uca.features import OBS_POINT_CLOUD, observation_info
 from lerobot_uca.hub import push_dataset
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO
 
@@ -189,9 +189,8 @@ def _features(env_config: PointCloudEnvConfig) -> dict[str, dict[str, Any]]:
         ACTION: {"dtype": "float32", "shape": (len(action_names),), "names": action_names},
     }
     recipe = env_config.recipe()
-    info: dict[str, Any] = {} if recipe is None else {RECIPE_INFO: recipe.as_dict()}
-    if env_config.observation == OBJECT_CLOUD:  # what nothing says is a point_cloud, as in older datasets
-        info[OBSERVATION_INFO] = OBJECT_CLOUD
+    made = {} if recipe is None else {RECIPE_INFO: recipe.as_dict()}
+    info = {**made, **observation_info(env_config.observation)}
     for name, feature in env_config.features.items():
         if feature.type is FeatureType.VISUAL:
             features[env_config.features_map[name]] = {

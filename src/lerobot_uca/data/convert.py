@@ -29,7 +29,7 @@ from lerobot_uca.data.sources.lerobot_source import LeRobotSource
 from lerobot_uca.data.sources.source import Source
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, OBSERVATION_INFO
+from lerobot_uca.features import OBS_POINT_CLOUD, observation_info
 from lerobot_uca.hub import push_dataset
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import MIN_SHARE
@@ -242,10 +242,9 @@ def _features(config: ConvertConfig, source: Source, episode: Episode) -> dict[s
             "n_points": config.n_points,
             "order": "farthest point sampling",
             "version": importlib.metadata.version("lerobot_policy_uca_flow"),
-        }
+        },
+        **observation_info(source.observation),
     }
-    if source.observation == OBJECT_CLOUD:
-        info[OBSERVATION_INFO] = OBJECT_CLOUD
     if recipe is not None:
         info[RECIPE_INFO] = replace(recipe, n_points=config.n_points).as_dict()
     return {

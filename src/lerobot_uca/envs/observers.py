@@ -1,7 +1,6 @@
 """Observing a simulated scene: as a point cloud, or as the depth image that a policy makes its cloud from."""
 
 from collections.abc import Sequence
-from typing import override
 
 import gymnasium as gym
 import mujoco
@@ -12,7 +11,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBJECT_CLOUD, POINT_CLOUD
 from lerobot_uca.point_clouds.cameras import DepthCamera, Marker, PointCloudCamera
 from lerobot_uca.point_clouds.depth import to_millimetres
-from lerobot_uca.point_clouds.geometry import Array, Camera, Crop, sample_farthest
+from lerobot_uca.point_clouds.geometry import Camera, Crop, sample_farthest
 
 
 class CloudObserver:
@@ -34,7 +33,7 @@ class CloudObserver:
         Raises:
             UserError: if it is empty.
         """
-        points = self._points(model, data, markers)
+        points = self.camera.capture(model, data, markers)
         if len(points) == 0:
             camera, crop = self.camera.camera, self.camera.crop
             raise UserError(
@@ -42,9 +41,6 @@ class CloudObserver:
                 f"the crop {crop.low} to {crop.high} m."
             )
         return sample_farthest(points, self.n_points)
-
-    def _points(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker]) -> Array:
-        return self.camera.capture(model, data, markers)
 
 
 class ObjectCloudObserver(CloudObserver):
@@ -56,12 +52,7 @@ class ObjectCloudObserver(CloudObserver):
 
     def __init__(self, camera: Camera, crop: Crop, n_points: int, robot: str) -> None:
         super().__init__(camera, crop, n_points, robot)
-        self._objects = PointCloudCamera(camera, crop, left_out=robot)
-
-    @override
-    def _points(self, model: mujoco.MjModel, data: mujoco.MjData, markers: Sequence[Marker]) -> Array:
-        points = self._objects.capture(model, data, markers)
-        return points if len(points) else super()._points(model, data, markers)
+        self.camera = PointCloudCamera(camera, crop, left_out=robot)
 
 
 class DepthObserver:

@@ -35,7 +35,8 @@ class PointCloudCamera:
     Args:
         camera: where the rays start and which way they go.
         crop: what to keep. Rays that miss it are never cast.
-        left_out: name of a body that, with all that hangs on it, hides what is behind it but gives no points.
+        left_out: name of a body that, with all that hangs on it, hides what is behind it but gives no points, unless
+            it hides everything.
     """
 
     def __init__(self, camera: Camera, crop: Crop, left_out: str | None = None) -> None:
@@ -58,11 +59,13 @@ class PointCloudCamera:
         rays, (distance, geom, _) = self._caster.rays, hits
         for marker in markers:
             geom[_put_nearer(distance, rays, marker)] = NO_GEOM
-        if self._left_out is not None:
-            distance[self._is_left_out(model)[geom]] = np.inf
         near = np.flatnonzero((distance >= self._enter) & (distance <= self._leave))
         points = rays.origin + rays.directions[near] * distance[near, None]
-        return points[self.crop.contains(points)]
+        is_seen = self.crop.contains(points)
+        if self._left_out is not None:
+            is_other = is_seen & ~self._is_left_out(model)[geom[near]]
+            is_seen = is_other if is_other.any() else is_seen
+        return points[is_seen]
 
     def _is_left_out(self, model: mujoco.MjModel) -> NDArray[np.bool_]:
         """Whether each geom is, (ngeom + 1,): the last one, at `NO_GEOM`, is none."""

@@ -4,10 +4,9 @@ Letters: B samples, O observation steps, N points, K cameras.
 """
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, override
+from typing import override
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
@@ -16,6 +15,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.distributed import independent_draws
+from lerobot_uca.policies.processor_step import SameFeaturesStep
 
 
 def augmentation_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
@@ -40,7 +40,7 @@ def augmentation_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
 
 @dataclass
 @ProcessorStepRegistry.register(name="cloud_augmentation_processor")
-class CloudAugmentationProcessorStep(ProcessorStep):
+class CloudAugmentationProcessorStep(SameFeaturesStep):
     """Moves clouds rigidly, shakes their points and leaves some out, in training only.
 
     A batch belongs to training if it holds actions and gradients are computed; an evaluation's, a robot's and a
@@ -107,16 +107,6 @@ class CloudAugmentationProcessorStep(ProcessorStep):
         order = torch.arange(cloud.shape[-2], device=cloud.device)
         chosen = torch.where(is_kept, order, kept_first.gather(-1, order % n_kept))
         return cloud.gather(-2, chosen[..., None].expand_as(cloud))
-
-    @override
-    def get_config(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @override
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
 
 
 def _directions(cloud: Tensor) -> Tensor:

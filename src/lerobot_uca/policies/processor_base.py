@@ -57,9 +57,7 @@ def make_processors(
             steps.rename_observations,
             DepthToCloudProcessorStep(recipe=config.depth.recipe),
             PointCloudProcessorStep(config.n_points, config.colour),
-            *augmentation_steps(config),
-            *scene_turn_steps(config),
-            *hand_frame_steps(config, stats[OBS_STATE]),
+            *_own_steps(config, stats[OBS_STATE]),
             steps.add_batch_dim,
             steps.to_device,
             steps.normalize,
@@ -97,9 +95,8 @@ def load_processors(
     processors = make(config, checkpoint, *args, **options, **overrides)
     for step in processors[0].steps:
         if isinstance(step, DepthToCloudProcessorStep):
-            step.recipe = config.depth.recipe or step.recipe  # a further training's, where that has another one
-            if config.observation == OBJECT_CLOUD:  # depth images show the robot
-                step.recipe = None
+            # A further training's, where that has another one; depth images show the robot.
+            step.recipe = None if config.observation == OBJECT_CLOUD else config.depth.recipe or step.recipe
             step.install(config.depth.calibration)
     _check_pipelines(config, checkpoint, *processors)
     return processors
@@ -136,12 +133,16 @@ def _check_pipelines(
         steps.insert(kinds.index(PointCloudProcessorStep), PointCloudProcessorStep())
     place = kinds.index(PointCloudProcessorStep)
     steps[place] = PointCloudProcessorStep(config.n_points, config.colour)
-    made = [
+    pre.steps = [*steps[: place + 1], *_own_steps(config, state_statistics), *steps[place + 1 :]]
+
+
+def _own_steps(config: PointCloudPolicyConfig, state_statistics: dict[str, Any]) -> list[ProcessorStep]:
+    """The steps that the configuration asks for, in metres."""
+    return [
         *augmentation_steps(config),
         *scene_turn_steps(config),
         *hand_frame_steps(config, state_statistics),
     ]
-    pre.steps = [*steps[: place + 1], *made, *steps[place + 1 :]]
 
 
 @dataclass

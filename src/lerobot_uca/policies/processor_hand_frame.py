@@ -4,12 +4,11 @@ Letters: B samples, O observation steps, N points, C channels, S state dimension
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, override
 
 import numpy as np
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
@@ -18,6 +17,7 @@ from torch import Tensor
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.processor_step import SameFeaturesStep
 
 
 def hand_frame_steps(config: PointCloudPolicyConfig, state_statistics: Mapping[str, Any]) -> list[ProcessorStep]:
@@ -50,7 +50,7 @@ def hand_frame_steps(config: PointCloudPolicyConfig, state_statistics: Mapping[s
 
 @dataclass
 @ProcessorStepRegistry.register(name="hand_frame_processor")
-class HandFrameProcessorStep(ProcessorStep):
+class HandFrameProcessorStep(SameFeaturesStep):
     """Moves each cloud (..., N, C) as if the hand were at its mean position; the state (..., S) stays as it is.
 
     What matters for the next motion is where things are from the hand. In the world's frame the encoder must learn that
@@ -80,13 +80,3 @@ class HandFrameProcessorStep(ProcessorStep):
         motion = state.new_tensor(self.mean) - state[..., self.dimensions]
         xyz = cloud[..., :3] + motion.unsqueeze(-2)
         return xyz if cloud.shape[-1] == 3 else torch.cat([xyz, cloud[..., 3:]], dim=-1)
-
-    @override
-    def get_config(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @override
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features

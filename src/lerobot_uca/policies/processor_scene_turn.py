@@ -3,11 +3,10 @@
 Letters: B samples, O observation steps, N points, C channels, S state dimensions, T horizon, A action dimensions.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any, override
+from dataclasses import dataclass
+from typing import override
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
@@ -16,6 +15,7 @@ from torch import Tensor
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.distributed import independent_draws
+from lerobot_uca.policies.processor_step import SameFeaturesStep
 
 
 def scene_turn_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
@@ -29,7 +29,7 @@ def scene_turn_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
 
 @dataclass
 @ProcessorStepRegistry.register(name="scene_turn_processor")
-class SceneTurnProcessorStep(ProcessorStep):
+class SceneTurnProcessorStep(SameFeaturesStep):
     """Turns a sample's clouds, states and actions as one, in training only.
 
     A robot in the turned scene, its hand at the same place, would move as the demonstration does, turned. What the
@@ -76,13 +76,3 @@ class SceneTurnProcessorStep(ProcessorStep):
         state, action = state.clone(), action.clone()
         state[..., self.states], action[..., self.actions] = positions.flatten(-2), motions.flatten(-2)
         return torch.cat([xy, cloud[..., 2:]], dim=-1), state, action
-
-    @override
-    def get_config(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @override
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
