@@ -81,6 +81,27 @@ def test_a_demonstration_cannot_end_before_it_is_one(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+def test_a_demonstration_can_go_straight(collected, tmp_path):
+    collect(config(tmp_path / "drawer", straight_paths=True))
+    straight, bent = (
+        np.stack([frame["action"] for frame in dataset])
+        for dataset in (LeRobotDataset("test/drawer", root=tmp_path / "drawer"), collected)
+    )
+    speed = np.hypot(*bent.T[:2])
+    assert speed.max() > 1.2
+    first = int((speed > 1).argmax())
+    np.testing.assert_array_equal(straight[:first], bent[:first])
+    assert np.hypot(*straight[first, :2]) == pytest.approx(1)
+    assert np.hypot(*straight.T[:2]).max() == pytest.approx(1)
+    assert len(straight) == len(bent)
+
+
+def test_joints_do_not_go_straight(tmp_path):
+    with pytest.raises(UserError, match=r"--straight_paths needs an expert that moves a hand along x and y"):
+        collect(config(tmp_path / "door", env=AdroitPointCloudConfig(task="door"), straight_paths=True))
+    assert not (tmp_path / "door").exists()
+
+
 def test_of_a_pushed_hand_the_dataset_holds_what_the_expert_would_have_done(tmp_path):
     env_config = collected_env()
     collect(config(tmp_path / "drawer", pushes=0.05))

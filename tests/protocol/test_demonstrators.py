@@ -92,9 +92,11 @@ def test_a_table_of_experts(tmp_path, capsys, monkeypatch):
 def test_a_table_of_experts_that_are_pushed_all_the_time(tmp_path, monkeypatch):
     monkeypatch.setattr(MetaworldPointCloudEnv, "observe", None)
     path = tmp_path / "table.csv"
-    main(["demonstrators", "--tasks=pick-place", "--episodes=1", "--pushes=0.99", f"--output={path}"])
+    options = ["--episodes=1", "--straight_paths", "--pushes=0.99"]
+    main(["demonstrators", "--tasks=pick-place", *options, f"--output={path}"])
     with path.open(newline="") as file:
         (row,) = csv.DictReader(file)
+    assert row["straight_paths"] == "True"
     assert (row["pushes"], row["demonstrations"]) == ("0.99", "0")
 
 

@@ -60,6 +60,7 @@ def test_demonstrations_are_made_as_the_setting_says(tmp_path, monkeypatch):
     values = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 4, "evaluations": 2}}}
     disturbed = {
         "smoothing": {"metaworld/reach": 0.5},
+        "straight_paths": {"metaworld": True},
         "pushes": {"metaworld": 0.1},
         "successful_steps": {"metaworld": 7},
         "observation": {"metaworld": "object_cloud"},
@@ -71,7 +72,7 @@ def test_demonstrations_are_made_as_the_setting_says(tmp_path, monkeypatch):
     ((command, arguments),) = called
     assert command == "lerobot-uca-collect"
     expected = {"--env.task=reach", "--n_episodes=10", "--smoothing=0.5", "--pushes=0.1", "--successful_steps=7"}
-    assert {*expected, "--env.observation=object_cloud"} <= set(arguments)
+    assert {*expected, "--straight_paths=true", "--env.observation=object_cloud"} <= set(arguments)
 
 
 def test_a_cell_without_space_stops_the_run_and_stays_open(folder, monkeypatch):

@@ -63,8 +63,14 @@ class PointCloudEnvConfig(EnvConfig):
         """Makes one environment of one task; light to send to another process."""
 
     @abstractmethod
-    def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
-        """Tries at demonstrations of one task, by the expert that a user has named, from a seed upwards."""
+    def attempts(
+        self, task: str, expert: str | None, first_seed: int, *, straight_paths: bool = False
+    ) -> Iterator[Attempt]:
+        """Tries at demonstrations of one task, by the expert that a user has named, from a seed upwards.
+
+        Raises:
+            UserError: if there is no such expert, or straight paths are asked of one that moves no hand.
+        """
 
     @abstractmethod
     def view(self, task: str) -> tuple[Camera, Crop]:
@@ -179,10 +185,12 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
         return metaworld.camera_of(task), metaworld.crop_of(task)
 
     @override
-    def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
+    def attempts(
+        self, task: str, expert: str | None, first_seed: int, *, straight_paths: bool = False
+    ) -> Iterator[Attempt]:
         if expert:
             raise UserError(f"Meta-World's experts are built in. Leave --expert out, got '{expert}'.")
-        return attempts_by_seed(partial(metaworld.ScriptedExpert, task), first_seed)
+        return attempts_by_seed(partial(metaworld.ScriptedExpert, task, straight_paths=straight_paths), first_seed)
 
     @override
     def task_description(self, task: str) -> str:
@@ -237,7 +245,14 @@ class AdroitPointCloudConfig(PointCloudEnvConfig):
         return adroit.TASKS[task].camera, adroit.TASKS[task].crop
 
     @override
-    def attempts(self, task: str, expert: str | None, first_seed: int) -> Iterator[Attempt]:
+    def attempts(
+        self, task: str, expert: str | None, first_seed: int, *, straight_paths: bool = False
+    ) -> Iterator[Attempt]:
+        if straight_paths:
+            raise UserError(
+                "--straight_paths needs an expert that moves a hand along x and y, as metaworld_pointcloud's do; "
+                "Adroit's move joints."
+            )
         return adroit_experts.attempts(task, expert, first_seed)
 
     @override

@@ -37,6 +37,7 @@ class Demonstrator(NamedTuple):
     """An expert's results on a task: a row of the table."""
 
     task: str
+    straight_paths: bool
     smoothing: float
     pushes: float
     episodes: int
@@ -51,9 +52,17 @@ class Demonstrator(NamedTuple):
     """Version."""
 
 
-def demonstrators(
-    tasks: Sequence[str], path: Path, *, expert: str | None, smoothing: float, pushes: float, n_episodes: int
-) -> list[Demonstrator]:
+class Demonstrating(NamedTuple):
+    """How experts demonstrate, as for lerobot-uca-collect."""
+
+    expert: str | None = None
+    """Who demonstrates Adroit's tasks."""
+    straight_paths: bool = False
+    smoothing: float = 1.0
+    pushes: float = 0.0
+
+
+def demonstrators(tasks: Sequence[str], path: Path, how: Demonstrating, n_episodes: int) -> list[Demonstrator]:
     """Write a table of experts as CSV, task by task, so that what is there stays when it is stopped.
 
     Raises:
@@ -63,7 +72,7 @@ def demonstrators(
 
     path.parent.mkdir(parents=True, exist_ok=True)
     rows: list[Demonstrator] = []
-    prepared = [(task, *_of_task(task, expert, smoothing, pushes)) for task in tasks]  # wrong options are told at once
+    prepared = [(task, *_of_task(task, how)) for task in tasks]  # wrong options are told at once
     for task, make_env, attempts in tqdm(prepared, desc="Experts", unit="task"):
         needed = make_env().min_successful_steps
         trials = list(_trials(make_env, islice(attempts, n_episodes)))
@@ -71,8 +80,9 @@ def demonstrators(
         rows.append(
             Demonstrator(
                 task=task,
-                smoothing=smoothing,
-                pushes=pushes,
+                straight_paths=how.straight_paths,
+                smoothing=how.smoothing,
+                pushes=how.pushes,
                 episodes=len(trials),
                 demonstrations=len(kept),
                 any_success=sum(trial.n_successful > 0 for trial in trials),
@@ -106,15 +116,13 @@ def _trials(make_env: Callable[[], PointCloudEnv], attempts: Iterator[Attempt]) 
             yield future.result()
 
 
-def _of_task(
-    task: str, expert: str | None, smoothing: float, pushes: float
-) -> tuple[Callable[[], PointCloudEnv], Iterator[Attempt]]:
+def _of_task(task: str, how: Demonstrating) -> tuple[Callable[[], PointCloudEnv], Iterator[Attempt]]:
     cell = Cell(task, "uca_flow", 0)
     config = EnvConfig.get_choice_class(cell.env_type)(task=cell.env_task)
     assert isinstance(config, PointCloudEnvConfig)
-    source = expert if cell.benchmark == "adroit" else None
-    attempts = smoothed(config.attempts(cell.env_task, source, FIRST_SEED), smoothing)
-    attempts = pushed(attempts, pushes, config.action_names())
+    source = how.expert if cell.benchmark == "adroit" else None
+    attempts = config.attempts(cell.env_task, source, FIRST_SEED, straight_paths=how.straight_paths)
+    attempts = pushed(smoothed(attempts, how.smoothing), how.pushes, config.action_names())
     return config.env_factory(cell.env_task), attempts
 
 

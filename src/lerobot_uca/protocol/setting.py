@@ -1,10 +1,10 @@
 """Settings for training and evaluating cells: a YAML file, or the name of one in this package's folder `settings`."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import yaml
 
@@ -34,6 +34,41 @@ class Length:
         return self.steps // self.evaluations
 
 
+class _Rule(NamedTuple):
+    """What a field of a setting may hold."""
+
+    keys: Collection[str]
+    is_valid: Callable[[Any], bool]
+    words: str
+
+
+_DEMONSTRATOR_RULES = {
+    "smoothing": _Rule(
+        SUITES["all"],
+        lambda value: isinstance(value, int | float) and 0 < value <= 1,
+        "numbers above 0 and up to 1 by 'benchmark/task'",
+    ),
+    "straight_paths": _Rule(
+        ("metaworld",), lambda value: isinstance(value, bool), "true or false by benchmark, metaworld alone"
+    ),
+    "pushes": _Rule(
+        ("metaworld",),
+        lambda value: isinstance(value, int | float) and 0 <= value < 1,
+        "a number from 0 and below 1 by benchmark, metaworld alone",
+    ),
+    "successful_steps": _Rule(
+        ENVIRONMENTS,
+        lambda value: type(value) is int and value >= 1,
+        f"whole numbers above 0 by benchmark ({', '.join(ENVIRONMENTS)})",
+    ),
+    "observation": _Rule(
+        ENVIRONMENTS,
+        lambda value: value in (POINT_CLOUD, OBJECT_CLOUD),
+        f"{POINT_CLOUD} or {OBJECT_CLOUD} by benchmark ({', '.join(ENVIRONMENTS)})",
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Setting:
     """All that decides a cell's result besides task, policy and seed."""
@@ -49,6 +84,8 @@ class Setting:
     """Expert episodes of a task."""
     smoothing: Mapping[str, float] = field(default_factory=dict)
     """The smoothing of experts' actions by task, as for lerobot-uca-collect."""
+    straight_paths: Mapping[str, bool] = field(default_factory=dict)
+    """Whether experts' hands go straight, by benchmark, as for lerobot-uca-collect."""
     pushes: Mapping[str, float] = field(default_factory=dict)
     """The probability of pushes by benchmark, as for lerobot-uca-collect."""
     successful_steps: Mapping[str, int] = field(default_factory=dict)
@@ -122,8 +159,7 @@ class Setting:
                     )
 
     def _check_mappings(self) -> None:
-        names = ("smoothing", "pushes", "successful_steps", "observation", "policy", "benchmarks", "policies")
-        values = {name: getattr(self, name) for name in names}
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.default_factory is dict}
         for outer in ("benchmarks", "policies"):
             if isinstance(values[outer], Mapping):
                 values |= {f"{outer}.{key}": options for key, options in values[outer].items()}
@@ -132,30 +168,10 @@ class Setting:
                 raise UserError(f"Setting '{self.name}': {name} must hold values by name, got {value!r}.")
 
     def _check_demonstrators(self) -> None:
-        for task, smoothing in self.smoothing.items():
-            if task not in SUITES["all"] or not isinstance(smoothing, int | float) or not 0 < smoothing <= 1:
-                raise UserError(
-                    f"Setting '{self.name}': smoothing holds numbers above 0 and up to 1 by 'benchmark/task', "
-                    f"got {task}: {smoothing!r}."
-                )
-        for benchmark, probability in self.pushes.items():
-            if benchmark != "metaworld" or not isinstance(probability, int | float) or not 0 <= probability < 1:
-                raise UserError(
-                    f"Setting '{self.name}': pushes holds a number from 0 and below 1 by benchmark, metaworld alone, "
-                    f"got {benchmark}: {probability!r}."
-                )
-        for benchmark, n_steps in self.successful_steps.items():
-            if benchmark not in ENVIRONMENTS or type(n_steps) is not int or n_steps < 1:
-                raise UserError(
-                    f"Setting '{self.name}': successful_steps holds whole numbers above 0 by benchmark "
-                    f"({', '.join(ENVIRONMENTS)}), got {benchmark}: {n_steps!r}."
-                )
-        for benchmark, observation in self.observation.items():
-            if benchmark not in ENVIRONMENTS or observation not in (POINT_CLOUD, OBJECT_CLOUD):
-                raise UserError(
-                    f"Setting '{self.name}': observation holds {POINT_CLOUD} or {OBJECT_CLOUD} by benchmark "
-                    f"({', '.join(ENVIRONMENTS)}), got {benchmark}: {observation!r}."
-                )
+        for name, rule in _DEMONSTRATOR_RULES.items():
+            for key, value in getattr(self, name).items():
+                if key not in rule.keys or not rule.is_valid(value):
+                    raise UserError(f"Setting '{self.name}': {name} holds {rule.words}, got {key}: {value!r}.")
 
     def as_values(self) -> dict[str, Any]:
         """The setting as plain values, for JSON."""

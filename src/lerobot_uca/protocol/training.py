@@ -42,6 +42,7 @@ def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
                 "root": dataset,
                 "n_episodes": folder.setting.demonstrations,
                 "smoothing": folder.setting.smoothing.get(cell.task, 1.0),
+                "straight_paths": folder.setting.straight_paths.get(cell.benchmark, False),
                 "pushes": folder.setting.pushes.get(cell.benchmark, 0.0),
             }
             if cell.benchmark in folder.setting.successful_steps:
