@@ -41,6 +41,17 @@ def test_a_command_that_is_killed_for_memory(tmp_path):
         run_python("import os; print('at work', flush=True); os.kill(os.getpid(), 9)", tmp_path / "log")
 
 
+def test_a_command_that_was_killed_in_the_middle_of_a_line_leaves_the_next_its_own(tmp_path):
+    log = tmp_path / "log"
+    with pytest.raises(CellError):
+        run_python("import os; print('step 1 of 3', end='', flush=True); os.kill(os.getpid(), 9)", log)
+    run_python("print('done')", log)
+    first, killed, second, done = log.read_text().splitlines()
+    assert killed == "step 1 of 3"
+    assert [line.partition(" ")[0] for line in (first, second)] == ["$", "$"]
+    assert done == "done"
+
+
 def test_a_command_that_finds_no_space(tmp_path):
     code = "import errno, os; raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))"
     with pytest.raises(NoSpaceError, match="python found no space left"):

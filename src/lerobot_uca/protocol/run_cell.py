@@ -60,6 +60,7 @@ def run_cell(folder: RunFolder, cell: Cell, expert: str | None) -> Outcome:
     except Exception as error:  # noqa: BLE001 (whatever it is, it concerns this cell alone)
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         with (files.path / "training.log").open("a", encoding="utf-8") as file:
+            file.write("\n")
             traceback.print_exc(file=file)
     write_json(files.failure, {"reason": reason})
     return Outcome.FAILED

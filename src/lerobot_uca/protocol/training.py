@@ -133,6 +133,8 @@ def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | 
     log.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "lerobot_uca.protocol.tied", str(Path(sys.executable).with_name(program))]
     with log.open("a", encoding="utf-8") as file:
+        if file.tell():  # what was killed leaves a progress bar without an end of line
+            file.write("\n")
         file.write(f"$ {program} {' '.join(arguments)}\n")
         file.flush()
         start = file.tell()
