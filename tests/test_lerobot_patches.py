@@ -238,6 +238,20 @@ def test_an_output_folder_that_cannot_be_made_is_refused(dataset_root, tmp_path)
     training(dataset_root, tmp_path / "file", ACTConfig).validate()  # LeRobot's own policies find out as before
 
 
+def test_bfloat16_is_for_processors_that_have_it(monkeypatch, caplog, dataset_root, tmp_path):
+    def dtype(*, is_there: bool) -> str:
+        monkeypatch.setattr(lerobot_patches, "has_bfloat16", lambda device: is_there)
+        config = training(dataset_root, tmp_path)
+        config.policy.dtype = "bfloat16"
+        config.validate()
+        return config.policy.dtype
+
+    assert dtype(is_there=True) == "bfloat16"
+    assert not caplog.messages
+    assert dtype(is_there=False) == "float32"
+    assert caplog.messages == ["This processor has no instructions for policy.dtype=bfloat16: training is in float32."]
+
+
 def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path):
     """By lerobot-eval, whose recordings say what they are, and by a training that evaluates on the way."""
     monkeypatch.setattr(lerobot_patches, "_evaluated", ContextVar("evaluated", default="point_cloud"))

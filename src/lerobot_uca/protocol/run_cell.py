@@ -4,6 +4,7 @@ It is a process of its own, so that whatever happens to it happens to one cell. 
 in the training from LeRobot's last checkpoint, and with the first evaluation whose rows are missing.
 """
 
+import json
 import logging
 import shutil
 import sys
@@ -142,8 +143,6 @@ def make_env(cell: Cell, plan: "PolicyPlan") -> Callable[[], "PointCloudEnv"]:
 
 
 def _n_frames(dataset: Path) -> int:
-    import json
-
     return json.loads((dataset / "meta" / "info.json").read_text(encoding="utf-8"))["total_frames"]
 
 
@@ -162,6 +161,7 @@ def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
         "inference": measure(checkpoint),
         "setting": setting.as_values(),
         "training_options": training.training_options(cell, setting),
+        "dtype": json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))["dtype"],  # the one it had
         **provenance(),
     }
 
