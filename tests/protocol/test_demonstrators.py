@@ -92,7 +92,7 @@ def test_a_table_of_experts(tmp_path, capsys, monkeypatch):
 def test_a_table_of_experts_that_are_pushed_all_the_time(tmp_path, monkeypatch):
     monkeypatch.setattr(MetaworldPointCloudEnv, "observe", None)
     path = tmp_path / "table.csv"
-    options = ["--episodes=1", "--straight_paths", "--pushes=0.99"]
+    options = ["--episodes=1", "--straight_paths=true", "--pushes=0.99"]
     main(["demonstrators", "--tasks=pick-place", *options, f"--output={path}"])
     with path.open(newline="") as file:
         (row,) = csv.DictReader(file)

@@ -126,7 +126,7 @@ How often each task's expert succeeds, and how much its actions change from step
 
   lerobot-uca-benchmark demonstrators --suite=paper --expert='experts/{task}.npz' --output=demonstrators.csv
   lerobot-uca-benchmark demonstrators --tasks=pen --expert='experts/{task}.npz' --smoothing=0.3 --output=smooth.csv
-  lerobot-uca-benchmark demonstrators --tasks=very_hard --straight_paths --output=straight.csv
+  lerobot-uca-benchmark demonstrators --tasks=very_hard --straight_paths=true --output=straight.csv
   lerobot-uca-benchmark demonstrators --tasks=very_hard --pushes=0.025 --output=pushed.csv
 """
 
@@ -143,7 +143,14 @@ def _add_demonstrators(commands: "argparse._SubParsersAction[argparse.ArgumentPa
     parser.add_argument("--suite", default="paper", help="set of tasks (default: paper)")
     parser.add_argument("--tasks", help="tasks or groups out of the suite, separated by commas (default: all)")
     parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
-    parser.add_argument("--straight_paths", action="store_true", help="as for lerobot-uca-collect; Meta-World alone")
+    parser.add_argument(
+        "--straight_paths",
+        nargs="?",
+        const="true",
+        default="false",
+        choices=("true", "false"),
+        help="as for lerobot-uca-collect; Meta-World alone",
+    )
     parser.add_argument("--smoothing", type=float, default=1.0, help="as for lerobot-uca-collect (default: 1)")
     parser.add_argument("--pushes", type=float, default=0.0, help="as for lerobot-uca-collect (default: 0)")
     parser.add_argument("--episodes", type=int, default=50, help="of each task (default: 50)")
@@ -156,6 +163,6 @@ def _demonstrators(args: argparse.Namespace) -> None:
     if args.episodes < 1:
         raise UserError(f"--episodes must be at least 1, got {args.episodes}.")
     tasks = resolve_tasks(args.suite, args.tasks)
-    how = Demonstrating(args.expert, args.straight_paths, args.smoothing, args.pushes)
+    how = Demonstrating(args.expert, args.straight_paths == "true", args.smoothing, args.pushes)
     for row in demonstrators(tasks, args.output, how, args.episodes):
         print(f"{row.task}: {row.demonstrations} of {row.episodes} (any success: {row.any_success})")
