@@ -23,6 +23,7 @@ from torch.utils.flop_counter import flop_registry
 
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
+from lerobot_uca.policies.precision import has_bfloat16
 
 
 def main() -> None:
@@ -31,7 +32,9 @@ def main() -> None:
     parser.add_argument("--dim", type=int, default=128)
     parser.add_argument("--n_points", type=int, default=128)
     parser.add_argument("--batch_size", type=int, default=128)
-    parser.add_argument("--dtype", choices=["bfloat16", "float32"], default="bfloat16")
+    parser.add_argument(
+        "--dtype", choices=["bfloat16", "float32"], default="bfloat16" if has_bfloat16("cpu") else "float32"
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--steps", type=int, default=20)
     args = parser.parse_args()

@@ -19,6 +19,7 @@ from safetensors.torch import load_file
 from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.policies.precision import has_bfloat16
 from tests.builders import N_ACTIONS, N_POINTS, N_STATES, TINY_UNET, write_dataset
 
 BIN = Path(sys.executable).parent
@@ -133,6 +134,7 @@ def test_training_evaluates_in_the_environment(trained, tmp_path):
     evaluation = [*ENVIRONMENT, "--env_eval_freq=2", "--eval.n_episodes=1", "--policy.dtype=bfloat16"]
     log = succeed(*train(trained / "data", tmp_path / "train", *evaluation))
     assert "pc_success" in log
+    assert has_bfloat16("cpu") == ("training is in float32" not in log)
 
 
 def test_help_lists_and_teaches():

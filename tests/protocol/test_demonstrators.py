@@ -100,6 +100,11 @@ def test_a_table_of_experts_that_are_pushed_all_the_time(tmp_path, monkeypatch):
     assert (row["pushes"], row["demonstrations"]) == ("0.99", "0")
 
 
+def test_joints_have_no_table_of_straight_experts(tmp_path):
+    with pytest.raises(UserError, match="--straight_paths needs an expert that moves a hand"):
+        main(["demonstrators", "--tasks=door", "--expert=x.npz", "--straight_paths", f"--output={tmp_path}/table.csv"])
+
+
 def test_a_table_needs_episodes(tmp_path):
     with pytest.raises(UserError, match="--episodes must be at least 1, got 0"):
         main(["demonstrators", "--episodes=0", f"--output={tmp_path}/table.csv"])

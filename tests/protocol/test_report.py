@@ -49,6 +49,7 @@ def add_cell(folder, cell, n_final, interim=(0, 20, 20, 20, 20, 10)):
         "inference": {"median_ms": 2.0 + cell.seed},
         "minutes": {"training": 6.0, "evaluation": 1.0},
         "hardware": {"cpu": "a CPU", "gpu": None, "cores": 2, "threads": 1},
+        "dtype": ("bfloat16", "float32")[cell.seed],
     }
     write_json(files.result, record)
 
@@ -101,7 +102,8 @@ def test_table_1(folder, tmp_path, capsys):
     assert honest[3].endswith("(2 of 21 tasks)")
     assert honest[7].endswith("(2 of 37 tasks)")
     assert lines["DP3", "ours, honest"] == ["missing"] * 8
-    assert "Setting 'tiny': made up. Made on: a CPU (2 cores, 1 thread a cell)." in capsys.readouterr().out
+    kinds = "; ".join(f"a CPU (2 cores, 1 thread a cell, trained in {dtype})" for dtype in ("bfloat16", "float32"))
+    assert f"Setting 'tiny': made up. Made on: {kinds}." in capsys.readouterr().out
 
 
 WIDE = """\\documentclass{article}

@@ -12,6 +12,7 @@ import yaml
 from tests.builders import N_POINTS, write_dataset
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.policies.precision import has_bfloat16
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import RunFolder
 from lerobot_uca.protocol.report import report
@@ -30,7 +31,7 @@ TINY = {
     "demonstrations": 1,
     "interim_episodes": 1,
     "final_episodes": 2,
-    "policy": {"device": "cpu", "n_points": N_POINTS, "inference": "eager"},
+    "policy": {"device": "cpu", "n_points": N_POINTS, "inference": "eager", "dtype": "bfloat16"},
     "policies": {"uca_flow": {"dim": 16, "n_layers": 1, "n_heads": 2}, "simple_dp3": {"horizon": 3}},
 }
 
@@ -97,6 +98,7 @@ def test_a_result_says_how_it_was_made(finished):
     assert result["setting"] == folder.setting.as_values()
     assert result["versions"]["lerobot"] == "0.6.1"
     assert result["hardware"]["cores"] >= 1
+    assert result["dtype"] == ("bfloat16" if has_bfloat16("cpu") else "float32")
     assert result["minutes"]["training"] > 0
     assert result["inference"]["median_ms"] > 0
     checkpoints = folder.cell(GOOD).training / "checkpoints"

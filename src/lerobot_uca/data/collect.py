@@ -60,9 +60,9 @@ class CollectConfig:
     # Weight of the expert's new action against the last one, a first-order filter: 1 for the expert as it is. An expert
     # that chatters is easier to imitate when it is smoothed, and may even succeed more often (docs/benchmark.md).
     smoothing: float = 1.0
-    # The hand goes straight to where the expert wants it, equally fast in all horizontal directions. By default x and y
-    # are limited one by one, as in the papers: far from its aim the hand goes diagonally, the last part along one axis.
-    # Straight paths are learned better, above all with --policy.scene_turn (docs/results.md). Meta-World alone.
+    # Horizontally the hand goes straight to where the expert wants it, equally fast in all directions. By default x and
+    # y are limited one by one, as in the papers: far from its aim the hand goes diagonally, the last part along one
+    # axis. With --policy.scene_turn a straight motion still fits when it is turned (docs/results.md). Meta-World alone.
     straight_paths: bool = False
     # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction, and in
     # one of three pushes the gripper as well. The dataset holds what the expert would have done, so it shows how to

@@ -192,9 +192,9 @@ class ScriptedExpert:
 
     Args:
         task: its name, without '-v3'.
-        straight_paths: whether the hand goes straight to where it wants to be, at most at full speed, the same in all
-            horizontal directions. Otherwise x and y are limited one by one, as the environment does: far from its aim
-            the hand goes diagonally, 1.4 times as fast, and the last part along one axis.
+        straight_paths: whether the hand goes horizontally straight to where it wants to be, at most at full speed, the
+            same in all directions. Otherwise x and y are limited one by one, as the environment does: far from its aim
+            the hand goes diagonally, up to 1.4 times as fast, and the last part along one axis.
     """
 
     def __init__(self, task: str, *, straight_paths: bool = False) -> None:

@@ -92,9 +92,9 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # openvino_bfloat16 is faster still where the processor has bfloat16 instructions, UCA-Flow's actions within
     # about 2 % of their range (docs/inference.md).
     inference: str = "eager"
-    # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). A processor without instructions
-    # for bfloat16 trains in float32 and says so. LeRobot also evaluates with it during training; lerobot-eval uses
-    # float32 unless told policy.use_amp=true.
+    # Precision of training: float32 or bfloat16 (autocast; the weights stay float32). LeRobot also evaluates with it
+    # during training; lerobot-eval uses float32 unless told policy.use_amp=true. A processor without instructions for
+    # bfloat16 trains in float32 and says so.
     dtype: str = "float32"
     # The averaged weights follow with decay 1 - (1 + step)^-ema_power, step 0 at the first two updates as in the
     # baselines' code ...

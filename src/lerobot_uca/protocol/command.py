@@ -149,7 +149,7 @@ def _add_demonstrators(commands: "argparse._SubParsersAction[argparse.ArgumentPa
         const="true",
         default="false",
         choices=("true", "false"),
-        help="as for lerobot-uca-collect; Meta-World alone",
+        help="as for lerobot-uca-collect; Meta-World alone (default: false)",
     )
     parser.add_argument("--smoothing", type=float, default=1.0, help="as for lerobot-uca-collect (default: 1)")
     parser.add_argument("--pushes", type=float, default=0.0, help="as for lerobot-uca-collect (default: 0)")
@@ -163,6 +163,11 @@ def _demonstrators(args: argparse.Namespace) -> None:
     if args.episodes < 1:
         raise UserError(f"--episodes must be at least 1, got {args.episodes}.")
     tasks = resolve_tasks(args.suite, args.tasks)
-    how = Demonstrating(args.expert, args.straight_paths == "true", args.smoothing, args.pushes)
+    how = Demonstrating(
+        expert=args.expert,
+        straight_paths=args.straight_paths == "true",
+        smoothing=args.smoothing,
+        pushes=args.pushes,
+    )
     for row in demonstrators(tasks, args.output, how, args.episodes):
         print(f"{row.task}: {row.demonstrations} of {row.episodes} (any success: {row.any_success})")

@@ -173,9 +173,13 @@ class Results:
         return (float(np.mean(times)), float(np.std(times))) if times else None
 
     def hardware(self) -> list[str]:
-        """The hardware that the cells ran on."""
-        kinds = {json.dumps(record["hardware"], sort_keys=True): record["hardware"] for record in self.records.values()}
-        return [
-            f"{each['gpu'] or each['cpu']} ({each['cores']} cores, {each['threads']} thread a cell)"
-            for each in kinds.values()
-        ]
+        """The hardware that the cells ran on, and the precision of their trainings, which depends on it."""
+        kinds = dict.fromkeys(
+            (json.dumps(record["hardware"], sort_keys=True), record.get("dtype")) for record in self.records.values()
+        )
+        return [_hardware(json.loads(hardware), dtype) for hardware, dtype in kinds]
+
+
+def _hardware(kind: dict[str, Any], dtype: str | None) -> str:
+    precision = f", trained in {dtype}" if dtype else ""
+    return f"{kind['gpu'] or kind['cpu']} ({kind['cores']} cores, {kind['threads']} thread a cell{precision})"

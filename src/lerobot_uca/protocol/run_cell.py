@@ -60,8 +60,7 @@ def run_cell(folder: RunFolder, cell: Cell, expert: str | None) -> Outcome:
         reason = str(error)
     except Exception as error:  # noqa: BLE001 (whatever it is, it concerns this cell alone)
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        with (files.path / "training.log").open("a", encoding="utf-8") as file:
-            file.write("\n")
+        with training.open_log(files.path / "training.log") as file:
             traceback.print_exc(file=file)
     write_json(files.failure, {"reason": reason})
     return Outcome.FAILED
@@ -161,7 +160,8 @@ def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
         "inference": measure(checkpoint),
         "setting": setting.as_values(),
         "training_options": training.training_options(cell, setting),
-        "dtype": json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))["dtype"],  # the one it had
+        # The last checkpoint's: the processor decides, too (policies/precision.py).
+        "dtype": json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))["dtype"],
         **provenance(),
     }
 

@@ -132,9 +132,7 @@ def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | 
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "lerobot_uca.protocol.tied", str(Path(sys.executable).with_name(program))]
-    with log.open("a", encoding="utf-8") as file:
-        if file.tell():  # what was killed leaves a progress bar without an end of line
-            file.write("\n")
+    with open_log(log) as file:
         file.write(f"$ {program} {' '.join(arguments)}\n")
         file.flush()
         start = file.tell()
@@ -147,6 +145,14 @@ def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | 
         if os.strerror(errno.ENOSPC) in said or os.strerror(errno.EDQUOT) in said:
             raise NoSpaceError(f"{program} found no space left on the disk of '{log.parent}'.")
         raise CellError(f"{program} {ended(result.returncode)}: {_last_line(said)} (see {log})")
+
+
+def open_log(path: Path) -> TextIOWrapper:
+    """A log to add to, on a new line: what was killed leaves a progress bar without an end of line."""
+    file = path.open("a", encoding="utf-8")
+    if file.tell():
+        file.write("\n")
+    return file
 
 
 def ended(returncode: int) -> str:
