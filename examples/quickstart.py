@@ -40,7 +40,7 @@ STEPS = (
     Step(
         f"lerobot-train --config_path=uca_flow_small --dataset.repo_id=local/{TASK} "
         f"--dataset.root={DATASET} --output_dir={TRAINING}",
-        "about 70 seconds",
+        "about 70 seconds; longer without bfloat16 instructions",
         TRAINING,
         CHECKPOINT / "model.safetensors",
     ),
