@@ -1,4 +1,4 @@
-# make quickstart   demonstrations, training and evaluation of a real Meta-World task, about 2 minutes on two cores with bfloat16
+# make quickstart   demonstrations, training and evaluation of a Meta-World task, about 2 minutes on two cores (with bfloat16)
 # make ur5e-demo    a simulated UR5e recorded, trained, rolled out and replayed
 # make test         the tests
 # make check        style, types, formatting, dependencies, known vulnerabilities of their pinned versions

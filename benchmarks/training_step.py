@@ -32,12 +32,11 @@ def main() -> None:
     parser.add_argument("--dim", type=int, default=128)
     parser.add_argument("--n_points", type=int, default=128)
     parser.add_argument("--batch_size", type=int, default=128)
-    parser.add_argument(
-        "--dtype", choices=["bfloat16", "float32"], default="bfloat16" if has_bfloat16("cpu") else "float32"
-    )
+    parser.add_argument("--dtype", choices=["bfloat16", "float32"], help="default: bfloat16 if the device has it")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--steps", type=int, default=20)
     args = parser.parse_args()
+    args.dtype = args.dtype or ("bfloat16" if has_bfloat16(args.device) else "float32")
 
     sizes = {"dim": args.dim, "n_points": args.n_points, "dtype": args.dtype}
     policy = make_policy(device=args.device, **sizes).train()

@@ -27,6 +27,7 @@ from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
+from lerobot_uca.policies import precision
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from lerobot_uca.protocol.cells import Cell
@@ -240,7 +241,7 @@ def test_an_output_folder_that_cannot_be_made_is_refused(dataset_root, tmp_path)
 
 def test_bfloat16_is_for_processors_that_have_it(monkeypatch, caplog, dataset_root, tmp_path):
     def dtype(*, is_there: bool) -> str:
-        monkeypatch.setattr(lerobot_patches, "has_bfloat16", lambda device: is_there)
+        monkeypatch.setattr(precision, "has_bfloat16", lambda device: is_there)
         config = training(dataset_root, tmp_path)
         config.policy.dtype = "bfloat16"
         config.validate()

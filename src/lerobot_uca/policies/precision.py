@@ -1,8 +1,24 @@
 """Whether a device computes in bfloat16, or only imitates it."""
 
+import logging
 import platform
 
 import torch
+
+logger = logging.getLogger(__name__)
+
+
+def dtype_of_training(dtype: str, device: str) -> str:
+    """The precision to train in: float32 where bfloat16 is only imitated (2.8 instead of 0.32 s a step on AVX2 alone).
+
+    Args:
+        dtype: the one that is wanted, float32 or bfloat16.
+        device: PyTorch's name of it.
+    """
+    if dtype == "bfloat16" and not has_bfloat16(device):
+        logger.warning("This processor has no instructions for policy.dtype=bfloat16: training is in float32.")
+        return "float32"
+    return dtype
 
 
 def has_bfloat16(device: str) -> bool:
