@@ -17,7 +17,7 @@ ur5e-demo: $(INSTALLED)
 	$(BIN)/python examples/ur5e_demo.py
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses=logical --maxprocesses=4 --dist=loadfile
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

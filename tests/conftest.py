@@ -9,6 +9,7 @@ import pytest
 import torch
 
 os.environ.setdefault("HF_HUB_OFFLINE", "1")  # no test may need the network
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # a process of tests for each core, and the commands they start
 
 import lerobot_policy_uca_flow  # noqa: F401  (registers everything, as LeRobot's commands do)
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy

@@ -1,9 +1,7 @@
 """The public commands, end to end and tiny, as a user types them."""
 
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -21,8 +19,8 @@ from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.precision import has_bfloat16
 from tests.builders import N_ACTIONS, N_POINTS, N_STATES, TINY_UNET, write_dataset
+from tests.forked import run_command
 
-BIN = Path(sys.executable).parent
 ENVIRONMENT = ["--env.type=metaworld_pointcloud", "--env.task=drawer-close", f"--env.n_points={N_POINTS}"]
 TINY = [
     *("--policy.type=uca_flow", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim=16"),
@@ -30,21 +28,15 @@ TINY = [
 ]
 
 
-def run(*command: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    program, *arguments = map(str, command)
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", **variables}
-    return subprocess.run([BIN / program, *arguments], capture_output=True, text=True, env=environment, check=False)
-
-
-def succeed(*command: str | Path, **variables: str) -> str:
-    result = run(*command, **variables)
+def succeed(*command: str | Path) -> str:
+    result = run_command(*command)
     assert result.returncode == 0, result.stderr[-3000:]
     return result.stdout + result.stderr
 
 
-def fail(*command: str | Path, **variables: str) -> str:
+def fail(*command: str | Path) -> str:
     """The one line in which a failing command says what is wrong; there must be no traceback."""
-    result = run(*command, **variables)
+    result = run_command(*command)
     assert result.returncode != 0
     assert "Traceback" not in result.stderr, result.stderr[-3000:]
     (line,) = re.findall(r"error: .*", result.stderr)
@@ -196,8 +188,6 @@ def test_a_dataset_without_a_cloud(tmp_path):
 
 
 def test_a_dataset_with_nan_points(tmp_path):
-    import numpy as np
-
     def spoil(frame, episode, index):
         if (episode, index) == (1, 4):
             frame[OBS_POINT_CLOUD][3, 1] = np.nan
@@ -239,7 +229,7 @@ def test_collecting_into_an_unwritable_folder(tmp_path):
 
 def test_an_upload_that_fails_says_that_the_dataset_is_safe(tmp_path):
     command = ["lerobot-uca-collect", *ENVIRONMENT, "--repo_id=a/b", "--n_episodes=1", f"--root={tmp_path}/data"]
-    line = fail(*command, "--push_to_hub", HF_HUB_OFFLINE="1")
+    line = fail(*command, "--push_to_hub")
     assert line.startswith(f"error: The dataset in '{tmp_path}/data' is complete but could not be uploaded: ")
     assert (tmp_path / "data" / "meta" / "info.json").exists()
 

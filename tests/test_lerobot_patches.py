@@ -3,9 +3,7 @@
 import ast
 import json
 import logging
-import os
 import pkgutil
-import subprocess
 import sys
 from contextvars import ContextVar
 from pathlib import Path
@@ -33,11 +31,7 @@ from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.setting import Setting
 from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
-
-
-def run(code: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **variables})
+from tests.forked import run_code
 
 
 def training(root: Path, output: Path, policy: type = UCAFlowConfig, **options: object) -> TrainPipelineConfig:
@@ -133,7 +127,7 @@ def test_switch(switch, expected):
     code = (
         "import lerobot_policy_uca_flow\nfrom lerobot.datasets import factory\nprint(factory.LeRobotDataset.__name__)"
     )
-    assert run(code, **{lerobot_patches.SWITCH: switch}).stdout.strip() == expected
+    assert run_code(code, **{lerobot_patches.SWITCH: switch}).stdout.strip() == expected
 
 
 def test_only_the_dataset_factory_knows_the_batched_dataset():
@@ -148,7 +142,7 @@ def test_a_newer_lerobot_is_left_alone():
         "from lerobot.datasets import factory\n"
         "print(factory.LeRobotDataset.__name__)"
     )
-    result = run(code)
+    result = run_code(code)
     assert result.stdout.strip() == "LeRobotDataset"
     assert "LeRobot 0.7.0 is too new: this package is made for 0.6.1." in result.stderr
 
@@ -160,7 +154,7 @@ def test_an_older_lerobot_that_lacks_modules_is_named_in_one_line():
         "import lerobot; lerobot.__version__ = '0.6.0'\n"
         "import lerobot_policy_uca_flow"
     )
-    (line,) = [line for line in run(code).stderr.splitlines() if "lerobot_uca" in line or "LeRobot" in line]
+    (line,) = [line for line in run_code(code).stderr.splitlines() if "lerobot_uca" in line or "LeRobot" in line]
     assert "LeRobot 0.6.0 is too old: this package is made for 0.6.1. Not available: " in line
     assert "policies.processor_base" in line
     assert line.endswith("To mend it: pip install lerobot==0.6.1")
@@ -207,14 +201,16 @@ def test_installing_twice_changes_nothing():
 
 
 def test_a_users_error_is_one_line():
-    result = run("import lerobot_policy_uca_flow\nfrom lerobot_uca.errors import UserError\nraise UserError('mend it')")
+    result = run_code(
+        "import lerobot_policy_uca_flow\nfrom lerobot_uca.errors import UserError\nraise UserError('mend it')"
+    )
     assert result.returncode == 1
     assert result.stderr.strip() == "error: mend it"
 
 
 @pytest.mark.parametrize("error", ["PermissionError(13, 'no')", "OSError(28, 'no space')", "ValueError('other')"])
 def test_other_errors_keep_their_traceback(error):
-    result = run(f"import lerobot_policy_uca_flow\nraise {error}")
+    result = run_code(f"import lerobot_policy_uca_flow\nraise {error}")
     assert result.returncode == 1
     assert result.stderr.startswith("Traceback")
 

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.forked import run_code
+
 SOURCE = Path(__file__).parent.parent / "src" / "lerobot_uca"
 DISTRIBUTION = "lerobot_policy_uca_flow"
 
@@ -235,8 +237,7 @@ assert brought - {"openvino_telemetry"} == {"lerobot_policy_uca_flow", "lerobot_
 
 
 def load(before: str, after: str) -> subprocess.CompletedProcess[str]:
-    code = f"{before}\nimport lerobot_policy_uca_flow\n{after}"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    return run_code(f"{before}\nimport lerobot_policy_uca_flow\n{after}")
 
 
 BREAKS = {

@@ -137,7 +137,7 @@ def test_a_command_ends_cleanly(program, trained, tmp_path):
     command = [sys.executable, "-c", HEEDS_SIGNALS, BIN / program, *case.arguments(folder, trained)]
     printed = tmp_path / "printed.txt"
     with printed.open("w") as file:
-        options = {"env": {**os.environ, "OMP_NUM_THREADS": "1"}, "cwd": folder, "start_new_session": True}
+        options = {"cwd": folder, "start_new_session": True}
         process = subprocess.Popen(command, stdout=file, stderr=file, **options)
     try:
         wait_for(lambda: case.is_working(folder, printed.read_text()), process)
