@@ -51,6 +51,16 @@ def make_observation(batch_size: int = 1, cloud_points: int = CLOUD_POINTS, devi
     }
 
 
+def make_batch(policy: PointCloudPolicy, batch_size: int) -> dict[str, Tensor]:
+    """A batch of random training windows."""
+    config, device = policy.config, policy.config.device
+    return {
+        OBS_POINT_CLOUD: torch.rand(batch_size, config.n_obs_steps, CLOUD_POINTS, 3, device=device),
+        "observation.state": torch.rand(batch_size, config.n_obs_steps, N_STATES, device=device),
+        "action": torch.rand(batch_size, config.horizon, N_ACTIONS, device=device),
+    }
+
+
 def timed(function: Callable[..., Any], *arguments: Any, device: str = "cpu") -> tuple[float, Any]:
     """Milliseconds a call takes, the device's work included, and its result."""
     start = time.perf_counter()

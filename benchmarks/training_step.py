@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import CLOUD_POINTS, N_ACTIONS, N_STATES, make_policy, matrix_product_peak, print_provenance, timed
+from common import make_batch, make_policy, matrix_product_peak, print_provenance, timed
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
@@ -71,16 +71,6 @@ def main() -> None:
         floor = 1e3 * count / peak
         print(f"{'floor, ' + name:32}{floor:9.1f} ms", end="   ")
         print(f"{count / 1e9:.1f} GFLOP at {peak / 1e9:.0f} GFLOP/s; the step takes {stages[-1] / floor:.1f} x")
-
-
-def make_batch(policy: PointCloudPolicy, batch_size: int) -> dict[str, torch.Tensor]:
-    """A batch of random training windows."""
-    config, device = policy.config, policy.config.device
-    return {
-        OBS_POINT_CLOUD: torch.rand(batch_size, config.n_obs_steps, CLOUD_POINTS, 3, device=device),
-        "observation.state": torch.rand(batch_size, config.n_obs_steps, N_STATES, device=device),
-        "action": torch.rand(batch_size, config.horizon, N_ACTIONS, device=device),
-    }
 
 
 def plain_step(policy: PointCloudPolicy, batch: dict[str, torch.Tensor]) -> None:

@@ -50,6 +50,7 @@ TINY = {
     "lerobot-uca-convert": ["--n_points=32"],
     "lerobot-uca-view": ["--calibration=recorded_with", "--output=cloud.png"],
     "lerobot-uca-export": [],
+    "benchmarks/baseline_step.py": ["--steps=1", "--batch_size=4", "--widths", "16", "32"],
     "benchmarks/control_loop.py": ["--steps=3", "--tasks", "dial-turn"],
     "benchmarks/fit.py": [],
     "benchmarks/inference.py": ["--calls=1", "--batch_sizes", "1", "--computed_by", "eager"],

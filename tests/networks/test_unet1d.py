@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from lerobot_uca.networks.unet1d import IntervalUNet, TimeUNet
+from lerobot_uca.networks.unet1d import Convolution, IntervalUNet, TimeUNet
 
 TINY = {"n_actions": 3, "n_obs_steps": 2, "n_obs_features": 5, "time_dim": 8, "kernel_size": 3, "n_groups": 4}
 INPUTS = {TimeUNet: 1, IntervalUNet: 2}
@@ -23,6 +23,19 @@ def test_every_time_observation_and_action_step_reaches_the_output(kind, widths,
     for step in range(4):
         for gradient in torch.autograd.grad(actions[:, step].sum(), inputs, retain_graph=True):
             assert (gradient != 0).all()
+
+
+@pytest.mark.parametrize("length", range(1, 9))
+@pytest.mark.parametrize(("taps", "stride"), [(5, 1), (3, 1), (3, 2), (5, 2), (1, 1)])
+def test_in_training_a_convolution_is_pytorchs(length, taps, stride):
+    layer = Convolution(2, 3, taps, stride=stride, padding=taps // 2).double()
+    x = torch.randn(4, 2, length, dtype=torch.float64, requires_grad=True)
+    direction = torch.randn_like(x)
+    results = []
+    for mode in (layer.train, layer.eval):
+        y, tangent = torch.func.jvp(mode(), (x,), (direction,))
+        results.append((y, tangent, *torch.autograd.grad(y.square().sum(), (x, *layer.parameters()))))
+    torch.testing.assert_close(*results)
 
 
 def test_levels_are_the_features_of_the_way_down():
