@@ -1,6 +1,7 @@
 """Tables and figures of results made up so that every number can be told in advance."""
 
 import csv
+import json
 import re
 import shutil
 import subprocess
@@ -14,7 +15,7 @@ from tests.robots.conftest import wait_until
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, Cell
 from lerobot_uca.protocol.command import main
-from lerobot_uca.protocol.figures import COLOURS
+from lerobot_uca.protocol.figures import COLOURS, FIGURES
 from lerobot_uca.protocol.folder import RunFolder, write_json
 from lerobot_uca.protocol.paper import ABLATION, COLUMNS, MILLISECONDS, SUCCESS, goal
 from lerobot_uca.protocol.results import Results
@@ -186,6 +187,39 @@ def test_minutes_until_the_papers_success(tmp_path, interim, minutes):
     assert results.minutes_until(cell, goal(REACH).mean / 100) == minutes
 
 
+def test_success_over_minutes(folder, tmp_path):
+    """Two seeds of six minutes, of which one takes twice as long: an evaluation every 1.5 minutes in the mean."""
+    file = folder.cell(Cell(REACH, "uca_flow", 1)).result
+    record = json.loads(file.read_text())
+    write_json(file, {**record, "minutes": {"training": 12.0}})
+    results, _ = Results.read([folder.path])
+    curve = results.curve_over_minutes(REACH, "uca_flow")
+    assert curve == {1.5: [0, 0], 3: [1, 1], 4.5: [1, 1], 6: [1, 1], 7.5: [1, 1], 9: [0.5, 0.5]}
+    assert results.curve_over_minutes(WALL, "adaln") == {}
+
+
+def texts_of(figure, tmp_path):
+    """What is written in a figure of a report."""
+    return re.findall(r"<text[^>]*>([^<]*)</text>", (tmp_path / "report" / f"{figure}.svg").read_text())
+
+
+def test_policies_are_compared_on_what_all_have_learned(folder, tmp_path):
+    """Of two tasks and two seeds AdaLN has one task and one seed."""
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    assert {"UCA-Flow, 1 of 1", f"{POLICIES['adaln'].title}, 1 of 1"} <= set(texts_of("minutes_to_success", tmp_path))
+    assert REACH in texts_of("success_over_minutes", tmp_path)
+    assert WALL not in texts_of("success_over_minutes", tmp_path)
+
+
+def test_one_policy_is_shown_on_all_it_has_learned(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    add_cell(folder, Cell(REACH, "uca_flow", 0), 80)
+    add_cell(folder, Cell(WALL, "uca_flow", 0), 0, interim=(0, 0, 0, 0, 0, 0))
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    assert "UCA-Flow, 1 of 2" in texts_of("minutes_to_success", tmp_path)
+    assert not (tmp_path / "report" / "success_over_minutes.svg").exists()
+
+
 def test_goals():
     """Printed for the task, for its group, and not at all."""
     goals = {"metaworld/shelf-place": 74.0, "metaworld/reach": 92.4, "adroit/pen": 63.0, "metaworld/basketball": None}
@@ -237,12 +271,12 @@ def test_the_page_is_self_contained(folder, tmp_path):
     page = Page()
     page.feed(text)
     assert page.open == []
-    assert page.n_svg == 4
+    assert page.n_svg == 5
     assert all(reference.startswith("#") for reference in page.references)
     assert len(set(page.ids)) == len(page.ids)
     assert "<script" not in text
-    for png in ("success_over_epochs", "success_and_latency", "success_by_task", "minutes_to_success"):
-        assert (tmp_path / "report" / f"{png}.png").read_bytes().startswith(b"\x89PNG")
+    for figure in FIGURES:
+        assert (tmp_path / "report" / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
 
 
 @needs_browser

@@ -1,6 +1,7 @@
 """Figures of results. They read only what `Results` has read from CSV and JSON files."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import paper
-from lerobot_uca.protocol.cells import POLICIES
+from lerobot_uca.protocol.cells import POLICIES, Cell
 from lerobot_uca.protocol.results import Results
 
 COLOURS = dict(
@@ -57,8 +58,26 @@ def write(figure: Any, path: Path) -> Path:
 
 
 def curves(results: Results, plt: Any) -> Any:
-    """Success over epochs, a panel a task; the band is from the lowest to the highest seed."""
+    """Success over epochs, a panel a task."""
     tasks = [task for task in results.tasks if any(results.curve(task, policy) for policy in results.policies)]
+    return _panels(results, plt, tasks, results.curve, "epochs")
+
+
+def curves_over_minutes(results: Results, plt: Any) -> Any:
+    """Success over minutes of training, a panel for each task that two policies or more have learned."""
+    n_policies = Counter(task for task, _ in {(cell.task, cell.policy) for cell in results.records})
+    tasks = [task for task in results.tasks if n_policies[task] > 1]
+    figure = _panels(results, plt, tasks, results.curve_over_minutes, "minutes of training")
+    for axis, task in zip(figure.axes if figure else (), tasks, strict=False):
+        if goal := paper.goal(task):
+            axis.axhline(goal.mean, color="black", linewidth=0.8, linestyle="--")
+    return figure
+
+
+def _panels(
+    results: Results, plt: Any, tasks: Sequence[str], curve: Callable[[str, str], dict[float, list[float]]], over: str
+) -> Any:
+    """Success over something, a panel a task; the band is from the lowest to the highest seed."""
     if not tasks:
         return None
     n_columns = min(N_CURVE_COLUMNS, len(tasks))
@@ -66,21 +85,23 @@ def curves(results: Results, plt: Any) -> Any:
     figure, axes = plt.subplots(n_rows, n_columns, figsize=(3 * n_columns, 2.4 * n_rows), squeeze=False, sharey=True)
     for axis in axes.flat[len(tasks) :]:
         axis.set_visible(False)
+    drawn = {}
     for axis, task in zip(axes.flat, tasks, strict=False):
         for policy in results.policies:
-            curve = results.curve(task, policy)
-            epochs = list(curve)
-            rates = [np.multiply(100, each) for each in curve.values()]
-            means = [each.mean() for each in rates]
-            axis.plot(epochs, means, marker=".", color=COLOURS[policy], label=POLICIES[policy].title)
-            band = [each.min() for each in rates], [each.max() for each in rates]
-            axis.fill_between(epochs, *band, color=COLOURS[policy], alpha=0.2, linewidth=0)
+            if points := curve(task, policy):
+                at = list(points)
+                rates = [np.multiply(100, each) for each in points.values()]
+                means = [each.mean() for each in rates]
+                (drawn[policy],) = axis.plot(at, means, marker=".", color=COLOURS[policy])
+                band = [each.min() for each in rates], [each.max() for each in rates]
+                axis.fill_between(at, *band, color=COLOURS[policy], alpha=0.2, linewidth=0)
         axis.set_title(task)
         axis.set_ylim(-3, 103)
-        axis.set_xlabel("epochs")
+        axis.set_xlabel(over)
     for row in axes:
         row[0].set_ylabel("success [%]")
-    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="upper center", bbox_to_anchor=(0.5, 0), ncols=4)
+    titles = [POLICIES[policy].title for policy in drawn]
+    figure.legend(drawn.values(), titles, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=4)
     figure.tight_layout()
     return figure
 
@@ -137,20 +158,25 @@ def bars(results: Results, plt: Any) -> Any:
 
 
 def minutes_to_success(results: Results, plt: Any) -> Any:
-    """The share of cells that have reached the paper's success, over minutes of training, a line a policy."""
-    figure, axis = plt.subplots(figsize=(5, 3.2))
-    for policy in results.policies:
-        goals = {cell: goal for cell in results.records if cell.policy == policy and (goal := paper.goal(cell.task))}
-        minutes = [results.minutes_until(cell, goal.mean / 100) for cell, goal in goals.items()]
-        reached = sorted(each for each in minutes if each is not None)
-        if goals:
-            longest = max(results.training_minutes(cell) for cell in goals)
-            shares = 100 * np.arange(len(reached) + 1) / len(goals)
-            label = f"{POLICIES[policy].title}, {len(reached)} of {len(goals)}"
-            axis.step([0, *reached, longest], [*shares, shares[-1]], where="post", color=COLOURS[policy], label=label)
-    if not axis.lines:
-        plt.close(figure)
+    """The share of cells that have reached the paper's success, over minutes of training, a line a policy.
+
+    Of the tasks and seeds that every policy has, lest a line stand higher because its tasks are easier.
+    """
+    goals = {cell: goal for cell in results.records if (goal := paper.goal(cell.task))}
+    trained = {policy: {(cell.task, cell.seed) for cell in goals if cell.policy == policy} for policy in POLICIES}
+    trained = {policy: cells for policy, cells in trained.items() if cells}
+    common = set.intersection(*trained.values()) if trained else set()
+    if not common:
         return None
+    figure, axis = plt.subplots(figsize=(5, 3.2))
+    for policy in trained:
+        cells = [Cell(task, policy, seed) for task, seed in sorted(common)]
+        minutes = [results.minutes_until(cell, goals[cell].mean / 100) for cell in cells]
+        reached = sorted(each for each in minutes if each is not None)
+        longest = max(results.training_minutes(cell) for cell in cells)
+        shares = 100 * np.arange(len(reached) + 1) / len(cells)
+        label = f"{POLICIES[policy].title}, {len(reached)} of {len(cells)}"
+        axis.step([0, *reached, longest], [*shares, shares[-1]], where="post", color=COLOURS[policy], label=label)
     axis.set_ylim(0, 103)
     axis.set_xlim(left=0)
     axis.set_xlabel("minutes of training")
@@ -161,6 +187,7 @@ def minutes_to_success(results: Results, plt: Any) -> Any:
 
 FIGURES: dict[str, Callable[[Results, Any], Any]] = {
     "success_over_epochs": curves,
+    "success_over_minutes": curves_over_minutes,
     "success_and_latency": success_and_latency,
     "success_by_task": bars,
     "minutes_to_success": minutes_to_success,
@@ -168,6 +195,8 @@ FIGURES: dict[str, Callable[[Results, Any], Any]] = {
 CAPTIONS = {
     "success_over_epochs": "Success in the evaluations during training; the band is from the lowest to the highest "
     "training seed.",
+    "success_over_minutes": "Success in the evaluations during training over its minutes, on tasks that two or more "
+    "policies have learned; dashed the paper's UCA-Flow, on the task or on its group where no more is printed.",
     "success_and_latency": "Success of the last checkpoints and the time for a chunk of actions: filled ours, with "
     "95 % interval, over the tasks that are there; hollow the paper's, over its 37 tasks.",
     "success_by_task": "Success of the last checkpoints in fresh episodes, with 95 % interval; the black line is the "
@@ -175,7 +204,7 @@ CAPTIONS = {
     "minutes_to_success": "How many trainings (a task and a seed) have been, in an evaluation on the way, as "
     "successful as the paper's UCA-Flow on the task, or on the task's group where no more is "
     "printed, after so many minutes. An evaluation has few episodes, so some reach it by luck, "
-    "and earlier than they hold it.",
+    "and earlier than they hold it. Of several policies, the tasks and seeds that all have.",
     "rollouts": "An evaluation episode of each policy, from its start to its end: the first that ended as most did.",
 }
 """What a figure shows, by its file's name."""

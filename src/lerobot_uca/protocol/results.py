@@ -147,6 +147,17 @@ class Results:
                     by_epoch[self._epochs[task, step]].append(float(np.mean(successes)))
         return dict(sorted(by_epoch.items()))
 
+    def curve_over_minutes(self, task: str, policy: str) -> dict[float, list[float]]:
+        """Success by minutes of training, of each finished seed; the minutes are the seeds' mean."""
+        cells = [cell for cell in self.records if cell[:2] == (task, policy)]
+        by_step: dict[int, list[tuple[float, float]]] = defaultdict(list)
+        for cell in cells:
+            for step, successes in sorted(self._interim[cell].items()):
+                by_step[step].append((self._minutes_at(cell, step), float(np.mean(successes))))
+        return {
+            float(np.mean([each[0] for each in points])): [each[1] for each in points] for points in by_step.values()
+        }
+
     # Training time. ---------------------------------------------------------------------------------------------
 
     def training_minutes(self, cell: Cell) -> float:
@@ -154,12 +165,15 @@ class Results:
         return float(self.records[cell]["minutes"]["training"])
 
     def minutes_until(self, cell: Cell, success: float) -> float | None:
-        """Minutes of training, its steps equally long, before a finished cell's first evaluation with this success."""
-        n_steps = self.setting.length(cell).steps
+        """Minutes of training before a finished cell's first evaluation with this success."""
         for step, successes in sorted(self._interim[cell].items()):
             if np.mean(successes) >= success:
-                return self.training_minutes(cell) * step / n_steps
+                return self._minutes_at(cell, step)
         return None
+
+    def _minutes_at(self, cell: Cell, step: int) -> float:
+        """Minutes of training before a finished cell's step, its steps equally long."""
+        return self.training_minutes(cell) * step / self.setting.length(cell).steps
 
     # Inference. -------------------------------------------------------------------------------------------------
 
