@@ -69,6 +69,7 @@ def curves_over_minutes(results: Results, plt: Any) -> Any:
     tasks = [task for task in results.tasks if n_policies[task] > 1]
     figure = _panels(results, plt, tasks, results.curve_over_minutes, "minutes of training")
     for axis, task in zip(figure.axes if figure else (), tasks, strict=False):
+        axis.set_xlim(left=0)
         if goal := paper.goal(task):
             axis.axhline(goal.mean, color="black", linewidth=0.8, linestyle="--")
     return figure
