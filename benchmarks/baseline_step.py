@@ -31,8 +31,10 @@ def main() -> None:
     parser.add_argument("--n_points", type=int, default=128)
     parser.add_argument("--dtype", choices=["bfloat16", "float32"], help="default: bfloat16 if the device has it")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--steps", type=int, default=10)
     args = parser.parse_args()
+    torch.set_num_threads(args.threads)
     args.dtype = args.dtype or ("bfloat16" if has_bfloat16(args.device) else "float32")
     sizes: dict[str, dict[str, Any]] = {
         "uca_flow": {"dim": 128},
@@ -54,7 +56,7 @@ def row(policy_type: str, sizes: dict[str, Any], args: argparse.Namespace) -> di
         "points": args.n_points,
         "widths": " ".join(map(str, sizes.get("unet_widths", ()))),
         "dtype": args.dtype,
-        "threads": torch.get_num_threads(),
+        "threads": args.threads,
         "step_ms": f"{ours:.0f}",
         "with_pytorchs_convolutions_ms": f"{pytorchs:.0f}",
         "ratio": f"{pytorchs / ours:.2f}",
