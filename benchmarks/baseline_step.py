@@ -1,9 +1,10 @@
-"""Milliseconds of a training step of each policy; of the baselines also with PyTorch's own convolutions.
+"""Milliseconds of a training step of each policy, and with PyTorch's own convolutions in the baselines' U-Nets.
 
 python benchmarks/baseline_step.py                                # the sizes of the benchmark's setting `small`
 python benchmarks/baseline_step.py --widths 512 1024 2048         # the papers' U-Net
 
-Steps of the two kinds take turns. Weights and data are random: the time does not depend on them.
+Steps of the two kinds take turns. UCA-Flow has no convolutions: its ratio shows the noise. Weights and data are random;
+the time does not depend on them.
 """
 
 import argparse
