@@ -34,14 +34,14 @@ def _run(code: str, argv: Sequence[str], variables: Mapping[str, str]) -> subpro
     with tempfile.TemporaryDirectory() as folder:
         out, err = (Path(folder) / name for name in ("out", "err"))
         arguments = (code, argv, {**os.environ, **variables}, Path.cwd(), out, err)
-        process = _processes.Process(target=_be, args=arguments)
+        process = _processes.Process(target=_interpret, args=arguments)
         process.start()
         process.join()
         return subprocess.CompletedProcess(argv, process.exitcode, out.read_text(), err.read_text())
 
 
-def _be(code: str, argv: list[str], environment: dict[str, str], folder: Path, out: Path, err: Path) -> None:
-    """Be a new interpreter in this process: end as it would, with what it would print."""
+def _interpret(code: str, argv: list[str], environment: dict[str, str], folder: Path, out: Path, err: Path) -> None:
+    """What a new interpreter does with the code, in this process: it prints into the files, and ends as that would."""
     for stream, path in ((sys.stdout, out), (sys.stderr, err)):
         with path.open("wb") as file:
             os.dup2(file.fileno(), stream.fileno())
