@@ -35,7 +35,7 @@ for _part in (
 ):
     _load(_part)
 
-_patches = _load("lerobot_patches")
+_patches = _load("lerobot_patches.install")
 if _patches is not None:
     _patches.install()  # type: ignore[attr-defined]
 if not is_supported():

@@ -19,12 +19,13 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.scripts import lerobot_eval
 
-from lerobot_uca import configs, lerobot_patches
+from lerobot_uca import configs
 from lerobot_uca.data import batched_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
+from lerobot_uca.lerobot_patches import checkpoints, install, messages, reading, recording, settings
 from lerobot_uca.policies import precision
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
@@ -127,7 +128,7 @@ def test_switch(switch, expected):
     code = (
         "import lerobot_policy_uca_flow\nfrom lerobot.datasets import factory\nprint(factory.LeRobotDataset.__name__)"
     )
-    assert run_code(code, **{lerobot_patches.SWITCH: switch}).stdout.strip() == expected
+    assert run_code(code, **{reading.SWITCH: switch}).stdout.strip() == expected
 
 
 def test_only_the_dataset_factory_knows_the_batched_dataset():
@@ -160,7 +161,7 @@ def test_an_older_lerobot_that_lacks_modules_is_named_in_one_line():
     assert line.endswith("To mend it: pip install lerobot==0.6.1")
 
 
-@pytest.mark.parametrize("name", lerobot_patches.USED_NAMES)
+@pytest.mark.parametrize("name", install.USED_NAMES)
 def test_lerobot_has_what_is_used_of_it(name):
     """A port to another LeRobot: this says which one is gone."""
     assert callable(pkgutil.resolve_name(name))
@@ -168,8 +169,8 @@ def test_lerobot_has_what_is_used_of_it(name):
 
 def test_every_private_name_is_listed():
     """The list covers imports from LeRobot; methods are called on its objects by their names."""
-    listed = set(lerobot_patches.USED_NAMES)
-    for path in Path(lerobot_patches.__file__).parent.rglob("*.py"):
+    listed = set(install.USED_NAMES)
+    for path in Path(configs.__file__).parents[1].rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "lerobot":
                 private = {f"{node.module}.{alias.name}" for alias in node.names if alias.name.startswith("_")}
@@ -177,23 +178,24 @@ def test_every_private_name_is_listed():
 
 
 def test_every_patched_name_is_listed():
-    listed = set(lerobot_patches.USED_NAMES)
-    names = {**vars(lerobot_patches), "evaluation": lerobot_eval}
-    calls = [
-        node for node in ast.walk(ast.parse(Path(lerobot_patches.__file__).read_text())) if isinstance(node, ast.Call)
-    ]
-    patches = [call for call in calls if ast.unparse(call.func).startswith("_replace")]
-    assert len(patches) > 10
-    for call in patches:
-        target = eval(ast.unparse(call.args[0]), names)
-        method = f".{call.args[1].value}" if ast.unparse(call.func) != "_replace" else ""
-        assert f"{target.__module__}.{target.__qualname__}{method}" in listed
+    listed = set(install.USED_NAMES)
+    n_patches = 0
+    for module in (checkpoints, settings, reading, recording):
+        nodes = ast.walk(ast.parse(Path(module.__file__).read_text()))
+        calls = [(ast.unparse(node.func), node.args) for node in nodes if isinstance(node, ast.Call)]
+        for function, arguments in calls:
+            if function in ("replace", "replace_method", "replace_class_method"):
+                target = eval(ast.unparse(arguments[0]), {**vars(module), "evaluation": lerobot_eval})
+                method = f".{arguments[1].value}" if function != "replace" else ""
+                assert f"{target.__module__}.{target.__qualname__}{method}" in listed
+                n_patches += 1
+    assert n_patches > 10
 
 
 def test_installing_twice_changes_nothing():
-    lerobot_patches.install()  # again: another test may have loaded a library that sets the hook, as Ray does
+    install.install()  # again: another test may have loaded a library that sets the hook, as Ray does
     before = (factory.make_dataset, factory.LeRobotDataset, TrainPipelineConfig.validate, sys.excepthook)
-    lerobot_patches.install()
+    install.install()
     assert before == (factory.make_dataset, factory.LeRobotDataset, TrainPipelineConfig.validate, sys.excepthook)
 
 
@@ -217,7 +219,7 @@ def test_other_errors_keep_their_traceback(error):
 
 def test_the_decoders_warning_is_one_line_and_once(caplog):
     target = logging.getLogger("lerobot.utils.import_utils")
-    lerobot_patches.shorten_decoder_warning()
+    messages.shorten_decoder_warning()
     for each in target.filters:
         each._said = False
     for _ in range(3):
@@ -251,7 +253,9 @@ def test_bfloat16_is_for_processors_that_have_it(monkeypatch, caplog, dataset_ro
 
 def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path):
     """By lerobot-eval, whose recordings say what they are, and by a training that evaluates on the way."""
-    monkeypatch.setattr(lerobot_patches, "_evaluated", ContextVar("evaluated", default="point_cloud"))
+    mine = ContextVar("evaluated_observation", default="point_cloud")
+    for module in (recording, settings):
+        monkeypatch.setattr(module, "evaluated_observation", mine)
     clouds, objects = (MetaworldPointCloudConfig(observation=name) for name in ("point_cloud", "object_cloud"))
     UCAFlowPolicy(make_config(observation="object_cloud")).save_pretrained(tmp_path / "policy")
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path / 'policy'}"])

@@ -268,7 +268,7 @@ assert get_policy_class("uca_flow").__name__ == "UCAFlowPolicy"
 
 def test_a_broken_patch_never_takes_another_one_down():
     before = """
-import lerobot_uca.lerobot_patches as patches
+import lerobot_uca.lerobot_patches.install as patches
 def check_settings():
     raise AttributeError("module 'lerobot' has no attribute 'gone'")
 patches.check_settings = check_settings
@@ -285,7 +285,7 @@ assert hasattr(factory.LeRobotDataset, "__getitems__")
 
 def test_without_the_check_of_checkpoints_the_import_fails_and_leaves_the_rest():
     before = """
-import lerobot_uca.lerobot_patches as patches
+import lerobot_uca.lerobot_patches.install as patches
 def make_registered_steps_only():
     raise AttributeError("module 'lerobot' has no attribute 'gone'")
 patches.make_registered_steps_only = make_registered_steps_only

@@ -6,16 +6,16 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts import lerobot_eval
 
-from lerobot_uca import lerobot_patches
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.lerobot_patches.recording import record_what_can_be_trained
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from tests.builders import N_POINTS, make_config, make_statistics
 from tests.test_normalisation import train
 
 
 def test_a_recording_trains(tmp_path):
-    lerobot_patches.record_what_can_be_trained()  # as when lerobot-eval loads the plugin
+    record_what_can_be_trained()  # as when lerobot-eval loads the plugin
     config = MetaworldPointCloudConfig(task="drawer-close", n_points=N_POINTS)
     env = next(iter(config.create_envs(n_envs=1).values()))[0]
     policy = UCAFlowPolicy(make_config()).eval()
@@ -33,6 +33,6 @@ def test_a_recording_trains(tmp_path):
 
 
 def test_other_environments_are_recorded_as_ever():
-    lerobot_patches.record_what_can_be_trained()
+    record_what_can_be_trained()
     features = {"agent_pos": MetaworldPointCloudConfig(task="drawer-close").features["agent_pos"]}
     assert "agent_pos" in lerobot_eval._env_features_to_dataset_features(features)

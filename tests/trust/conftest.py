@@ -10,9 +10,9 @@ from hypothesis import HealthCheck, Phase, settings
 from lerobot.scripts import lerobot_eval, lerobot_train  # noqa: F401  (in memory before patches are installed anew)
 from tests.builders import SMALL_POLICIES, write_dataset
 
-from lerobot_uca import lerobot_patches
+from lerobot_uca.lerobot_patches.install import install
 
-lerobot_patches.install()  # what lerobot_eval has brought
+install()  # what lerobot_eval has brought
 
 N_STEPS = 12
 """The steps of the training, 5 an epoch: 39 frames in batches of 8."""

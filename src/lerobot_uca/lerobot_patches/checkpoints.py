@@ -1,0 +1,130 @@
+"""Checkpoints: what they may hold, saving, resuming and uploading them."""
+
+import logging
+import sys
+from collections.abc import Callable
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+from lerobot.common import train_utils
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies import factory as policy_factory
+from lerobot.processor import DataProcessorPipeline
+from lerobot.utils import utils
+
+from lerobot_uca.checkpoints.resuming import cycle_exactly, without_trace
+from lerobot_uca.checkpoints.saving import save_whole, update_last
+from lerobot_uca.checkpoints.steps import check_steps
+from lerobot_uca.errors import UserError, reported
+from lerobot_uca.hub import upload_command, uploading
+from lerobot_uca.lerobot_patches.replacing import replace, replace_class_method, replace_method
+from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.processor_base import load_processors
+from lerobot_uca.policies.publishing import Evaluation, PublishedPolicy
+
+logger = logging.getLogger(__name__)
+
+
+_of_point_cloud_policy: ContextVar[bool] = ContextVar("of_point_cloud_policy", default=False)
+
+
+def make_registered_steps_only() -> None:
+    """A checkpoint cannot name code to run; see `checkpoints/steps.py`. LeRobot imports and calls whatever it names."""
+
+    def checked(build: Callable[..., Any]) -> Callable[..., Any]:
+        def build_steps(cls: type, loaded_config: dict[str, Any], overrides: dict[str, Any]) -> Any:
+            check_steps(loaded_config, of_point_cloud_policy=_of_point_cloud_policy.get())
+            return build(cls, loaded_config, overrides)
+
+        return build_steps
+
+    def known(make: Callable[..., Any]) -> Callable[..., Any]:
+        def make_pre_post_processors(policy_cfg: Any, pretrained_path: Any = None, *args: Any, **kwargs: Any) -> Any:
+            if pretrained_path is None or not isinstance(policy_cfg, PointCloudPolicyConfig):
+                return make(policy_cfg, pretrained_path, *args, **kwargs)
+            token = _of_point_cloud_policy.set(True)
+            try:
+                with reported(f"The processors of '{pretrained_path}' cannot be loaded"):
+                    return load_processors(make, policy_cfg, pretrained_path, *args, **kwargs)
+            finally:
+                _of_point_cloud_policy.reset(token)
+
+        return make_pre_post_processors
+
+    replace_class_method(DataProcessorPipeline, "_build_steps_from_config", checked)
+    replace(policy_factory.make_pre_post_processors, known)
+
+
+def report_damaged_checkpoints() -> None:
+    """One line names the missing or damaged part. LeRobot shows a library's traceback."""
+
+    def policy(load: Callable[..., Any]) -> Callable[..., Any]:
+        def from_pretrained(cls: type, pretrained_name_or_path: Path | str, **kwargs: Any) -> Any:
+            with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded"):
+                return load(cls, pretrained_name_or_path, **kwargs)
+
+        return from_pretrained
+
+    def state(load: Callable[..., Any]) -> Callable[..., Any]:
+        def load_training_state(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> Any:
+            with reported(f"Training cannot go on from '{checkpoint_dir}'"):
+                return load(checkpoint_dir, *args, **kwargs)
+
+        return load_training_state
+
+    replace_class_method(PreTrainedConfig, "from_pretrained", policy)
+    replace(train_utils.load_training_state, state)
+
+
+def save_checkpoints_whole() -> None:
+    """See `checkpoints/saving.py`."""
+    replace(train_utils.save_checkpoint, save_whole)
+    replace(train_utils.update_last_checkpoint, update_last)
+
+
+def resume_exactly() -> None:
+    """See `checkpoints/resuming.py`."""
+    replace(utils.cycle, cycle_exactly)
+    evaluation = sys.modules.get("lerobot.scripts.lerobot_eval")  # where training has it from
+    if evaluation is not None:
+        replace(evaluation.eval_policy_all, lambda evaluate: _remember_success(without_trace(evaluate)))
+
+
+def _remember_success(evaluate: Callable[..., Any]) -> Callable[..., Any]:
+    """Remember the success rate for the policy's page on the Hub."""
+
+    def eval_policy_all(*args: Any, **kwargs: Any) -> Any:
+        info = evaluate(*args, **kwargs)
+        policy = kwargs.get("policy")
+        if isinstance(policy, PublishedPolicy):
+            n_episodes = info["overall"]["n_episodes"]
+            policy.evaluation = Evaluation(info["overall"]["pc_success"], n_episodes, kwargs.get("start_seed"))
+        return info
+
+    return eval_policy_all
+
+
+def report_failed_uploads() -> None:
+    """A checkpoint that cannot be uploaded is a warning, a policy an error in one line. LeRobot ends in a traceback."""
+
+    def checkpoint(push: Callable[..., None]) -> Callable[..., None]:
+        def push_checkpoint_to_hub(checkpoint_dir: Path, repo_id: str, **kwargs: Any) -> None:
+            retry = upload_command(repo_id, checkpoint_dir, f"checkpoints/{checkpoint_dir.name}")
+            try:
+                with uploading(f"Checkpoint '{checkpoint_dir}'", retry):
+                    push(checkpoint_dir, repo_id, **kwargs)
+            except UserError as error:
+                logger.warning("%s", error)  # the training goes on
+
+        return push_checkpoint_to_hub
+
+    def processors(push: Callable[..., Any]) -> Callable[..., Any]:
+        def push_to_hub(self: DataProcessorPipeline, repo_id: str, **kwargs: Any) -> Any:
+            with uploading(f"Pipeline '{self.name}'", upload_command(repo_id, Path(".../last/pretrained_model"))):
+                return push(self, repo_id, **kwargs)
+
+        return push_to_hub
+
+    replace(train_utils.push_checkpoint_to_hub, checkpoint)
+    replace_method(DataProcessorPipeline, "push_to_hub", processors)
