@@ -55,22 +55,24 @@ def test_a_quarter_turn_to_the_left():
     torch.testing.assert_close(turned_action, torch.stack([-y, x, *rest], dim=-1))
 
 
+@pytest.mark.parametrize("task", ["reach", "soccer"])
 @pytest.mark.parametrize("n_steps", [0, 40])  # the motion limited, and not
-def test_a_straight_experts_action_in_a_turned_scene_is_its_action_turned(n_steps):
-    """Reach's expert steers at its goal, so in a turned scene it would do what training's turned sample does."""
-    env = MetaworldPointCloudEnv("reach", n_points=16)
-    env.reset(seed=3)
-    expert = ScriptedExpert("reach", straight_paths=True)
+def test_a_straight_experts_action_in_a_turned_scene_is_its_action_turned(task, n_steps):
+    """These two steer by where hand, ball and goal are, so in a turned scene they would do what its sample does."""
+    env = MetaworldPointCloudEnv(task, n_points=16)
+    env.reset(seed=4)
+    expert = ScriptedExpert(task, straight_paths=True)
     for _ in range(n_steps):
         env.act(expert(env))
     observation, action = env.expert_observation, expert(env).astype(np.float64)
     assert (np.hypot(*action[:2]) > 0.999) == (n_steps == 0)
     state = torch.zeros(1, 1, N_STATES, dtype=torch.float64)
-    state[0, 0, :3], state[0, 0, 3:6] = torch.tensor(observation[:3]), torch.tensor(observation[-3:])
+    state[0, 0] = torch.tensor(np.concatenate([observation[:3], observation[4:7], observation[-3:]]))
     angle = torch.tensor([0.4], dtype=torch.float64)
     cloud = torch.zeros(1, 1, 1, 3, dtype=torch.float64)
     _, turned, turned_action = make_step().turned(cloud, state, torch.tensor(action)[None, None], angle)
-    observation = np.concatenate([turned[0, 0, :3], observation[3:-3], turned[0, 0, 3:6]])
+    hand, thing, goal = turned[0, 0].reshape(3, 3)
+    observation = np.concatenate([hand, observation[3:4], thing, observation[7:-3], goal])
     in_turned_scene = expert(SimpleNamespace(expert_observation=observation))
     np.testing.assert_allclose(in_turned_scene, turned_action[0, 0], atol=1e-6)
 

@@ -1,5 +1,6 @@
 """LeRobot's configurations of the environments: what `--env.type=...` finds."""
 
+import logging
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -26,6 +27,8 @@ from lerobot_uca.point_clouds.geometry import Camera, Crop
 from lerobot_uca.point_clouds.recipe import SIMULATED, CloudRecipe, DepthSource
 from lerobot_uca.processes import kill_at_the_end, signals_put_off
 from lerobot_uca.registry import register
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -190,6 +193,8 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
     ) -> Iterator[Attempt]:
         if expert:
             raise UserError(f"Meta-World's experts are built in. Leave --expert out, got '{expert}'.")
+        if task in metaworld.OWN_EXPERTS:
+            logger.warning("%s is demonstrated by this package's expert, not by Meta-World's, which fails more.", task)
         return attempts_by_seed(partial(metaworld.ScriptedExpert, task, straight_paths=straight_paths), first_seed)
 
     @override

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_uca.envs.experts.soccer import SoccerPolicy
 from lerobot_uca.envs.point_cloud_env import Observation, PointCloudEnv
 from lerobot_uca.envs.task_names import only_task, resolve_tasks
 from lerobot_uca.point_clouds.cameras import Marker
@@ -187,8 +188,14 @@ class MetaworldPointCloudEnv(PointCloudEnv):
         ]
 
 
+OWN_EXPERTS = {"soccer": SoccerPolicy}
+"""Instead of Meta-World's, which fail more often."""
+
+
 class ScriptedExpert:
-    """Meta-World's scripted demonstrator of a task, without noise. It sees the simulator's state, not the cloud.
+    """The scripted demonstrator of a task: Meta-World's, without noise, or one of `OWN_EXPERTS`.
+
+    It sees the simulator's state, not the cloud.
 
     Args:
         task: its name, without '-v3'.
@@ -200,7 +207,7 @@ class ScriptedExpert:
     def __init__(self, task: str, *, straight_paths: bool = False) -> None:
         from metaworld.policies import ENV_POLICY_MAP  # slow to import, and not needed to read a configuration
 
-        experts: Any = ENV_POLICY_MAP
+        experts: Any = {**ENV_POLICY_MAP, **{f"{name}-v3": policy for name, policy in OWN_EXPERTS.items()}}
         self._policy = experts[f"{task}-v3"]()
         self._straight_paths = straight_paths
 
