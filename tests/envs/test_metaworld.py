@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from lerobot.envs import make_env_config
 
+from lerobot_uca.data.collect import FIRST_SEED
 from lerobot_uca.envs import metaworld
+from lerobot_uca.envs.experts import metaworld_experts
 from lerobot_uca.envs.metaworld import (
     CLOUD_CAMERA,
     EPISODE_LENGTH,
@@ -78,17 +80,19 @@ def test_the_expert_succeeds_and_the_episode_can_go_on():
     assert sum(successes) > 100
 
 
-@pytest.mark.parametrize("seed", [1000000, 1000001, 1000007])
-def test_soccers_expert_succeeds_where_metaworlds_fails(seed, monkeypatch):
-    """The first of its failures in benchmarks/results/demonstrators.csv's episodes, with straight paths."""
+@pytest.mark.parametrize(
+    ("task", "seed"), [("soccer", 0), ("soccer", 1), ("peg-insert-side", 3), ("peg-insert-side", 7)]
+)
+def test_our_experts_succeed_where_metaworlds_fail(task, seed, monkeypatch):
+    """The first failures among the episodes of demonstrations, with straight paths."""
 
     def is_solved():
-        env, expert = MetaworldPointCloudEnv("soccer", n_points=16), ScriptedExpert("soccer", straight_paths=True)
-        env.reset(seed=seed)
+        env, expert = MetaworldPointCloudEnv(task, n_points=16), ScriptedExpert(task, straight_paths=True)
+        env.reset(seed=FIRST_SEED + seed)
         return any(env.act(expert(env))[3]["is_success"] for _ in range(EPISODE_LENGTH))
 
     assert is_solved()
-    monkeypatch.setattr(metaworld, "OWN_EXPERTS", {})
+    monkeypatch.setattr(metaworld_experts, "EXPERTS", {})
     assert not is_solved()
 
 

@@ -16,7 +16,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.envs import adroit, metaworld
-from lerobot_uca.envs.experts import adroit_experts
+from lerobot_uca.envs.experts import adroit_experts, metaworld_experts
 from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
 from lerobot_uca.envs.observers import OBSERVERS, depth_name
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
@@ -193,7 +193,7 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
     ) -> Iterator[Attempt]:
         if expert:
             raise UserError(f"Meta-World's experts are built in. Leave --expert out, got '{expert}'.")
-        if task in metaworld.OWN_EXPERTS:
+        if task in metaworld_experts.EXPERTS:
             logger.warning("%s is demonstrated by this package's expert, not by Meta-World's, which fails more.", task)
         return attempts_by_seed(partial(metaworld.ScriptedExpert, task, straight_paths=straight_paths), first_seed)
 

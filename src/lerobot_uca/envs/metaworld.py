@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.experts.soccer import SoccerPolicy
+from lerobot_uca.envs.experts import metaworld_experts
 from lerobot_uca.envs.point_cloud_env import Observation, PointCloudEnv
 from lerobot_uca.envs.task_names import only_task, resolve_tasks
 from lerobot_uca.point_clouds.cameras import Marker
@@ -188,12 +188,8 @@ class MetaworldPointCloudEnv(PointCloudEnv):
         ]
 
 
-OWN_EXPERTS = {"soccer": SoccerPolicy}
-"""Instead of Meta-World's, which fail more often."""
-
-
 class ScriptedExpert:
-    """The scripted demonstrator of a task: Meta-World's, without noise, or one of `OWN_EXPERTS`.
+    """The scripted demonstrator of a task: Meta-World's, without noise, or one of ours.
 
     It sees the simulator's state, not the cloud.
 
@@ -207,8 +203,8 @@ class ScriptedExpert:
     def __init__(self, task: str, *, straight_paths: bool = False) -> None:
         from metaworld.policies import ENV_POLICY_MAP  # slow to import, and not needed to read a configuration
 
-        experts: Any = {**ENV_POLICY_MAP, **{f"{name}-v3": policy for name, policy in OWN_EXPERTS.items()}}
-        self._policy = experts[f"{task}-v3"]()
+        experts: Any = ENV_POLICY_MAP
+        self._policy: Any = (metaworld_experts.EXPERTS.get(task) or experts[f"{task}-v3"])()
         self._straight_paths = straight_paths
 
     def __call__(self, env: MetaworldPointCloudEnv) -> NDArray[np.float32]:
