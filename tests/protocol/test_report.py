@@ -220,6 +220,14 @@ def test_one_policy_is_shown_on_all_it_has_learned(tmp_path):
     assert not (tmp_path / "report" / "success_over_minutes.svg").exists()
 
 
+def test_chosen_policies_are_reported_as_if_there_were_no_others(folder, tmp_path):
+    main(["report", str(folder.path), f"--output={tmp_path}/report", "--policies=uca_flow"])
+    assert "UCA-Flow, 4 of 4" in texts_of("minutes_to_success", tmp_path)
+    assert {row[1] for row in read_csv(tmp_path / "report" / "tasks.csv")[1:]} == {"uca_flow"}
+    with pytest.raises(UserError, match=r"There are no results yet in .* for dp3, mp1"):
+        main(["report", str(folder.path), f"--output={tmp_path}/other", "--policies=dp3,mp1"])
+
+
 def test_goals():
     """Printed for the task, for its group, and not at all."""
     goals = {"metaworld/shelf-place": 74.0, "metaworld/reach": 92.4, "adroit/pen": 63.0, "metaworld/basketball": None}

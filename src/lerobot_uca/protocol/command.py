@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid, resolve_tasks
+from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid, resolve_policies, resolve_tasks
 from lerobot_uca.protocol.launchers import Launcher, local, n_cores, on_ray, on_slurm
 from lerobot_uca.protocol.report import report
 from lerobot_uca.protocol.run import make_folder, run
@@ -92,6 +92,7 @@ The paper's Tables 1 to 3 with the paper's numbers beside ours, as Markdown, CSV
 
   lerobot-uca-benchmark report runs/small --output=report --html
   lerobot-uca-benchmark report runs/small --output=report --html --rollouts=door,drawer-close
+  lerobot-uca-benchmark report runs/small --output=report --policies=uca_flow
 
 Cells that are missing are shown as missing, so a report can be made while the run goes on. Several folders are taken
 together if they were made with one setting. The report's folder holds all rows, and can itself be reported.
@@ -108,6 +109,7 @@ def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     )
     parser.add_argument("runs", type=Path, nargs="+", metavar="DIR", help="folder of a run or of a report")
     parser.add_argument("--output", type=Path, default=Path("report"), help="folder to write (default: report)")
+    parser.add_argument("--policies", default=",".join(POLICIES), help="separated by commas (default: all)")
     parser.add_argument("--html", action="store_true", help="also one self-contained page, report.html")
     parser.add_argument(
         "--rollouts", metavar="TASKS", help="also strips of pictures, an episode of each policy on these tasks"
@@ -117,7 +119,8 @@ def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
 
 def _report(args: argparse.Namespace) -> None:
     tasks = resolve_tasks("all", args.rollouts) if args.rollouts is not None else ()
-    print(report(args.runs, args.output, as_html=args.html, rollouts_of=tasks))
+    policies = resolve_policies(args.policies)
+    print(report(args.runs, args.output, policies, as_html=args.html, rollouts_of=tasks))
     print(f"Written to {args.output}.", file=sys.stderr)
 
 

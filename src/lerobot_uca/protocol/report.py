@@ -20,12 +20,15 @@ tbody tr:hover { background: #f3f6fa } svg { max-width: 100%; height: auto }
 """
 
 
-def report(runs: Sequence[Path], output: Path, *, as_html: bool, rollouts_of: Sequence[str] = ()) -> str:
+def report(
+    runs: Sequence[Path], output: Path, policies: Sequence[str], *, as_html: bool, rollouts_of: Sequence[str] = ()
+) -> str:
     """Write tables (Markdown, CSV, LaTeX), figures (PNG, SVG) and the results themselves; the tables as Markdown.
 
     Args:
         runs: folders of runs or reports.
         output: folder to write.
+        policies: those to report.
         as_html: whether to write one page as well.
         rollouts_of: tasks of which an episode of each policy is shown; for that it is run again.
 
@@ -35,8 +38,9 @@ def report(runs: Sequence[Path], output: Path, *, as_html: bool, rollouts_of: Se
     results, corrupt = Results.read(runs)
     for line in corrupt:
         print(f"warning: {line}", file=sys.stderr)
+    results = results.of(policies)
     if not results.rows:
-        raise UserError(f"There are no results yet in {', '.join(map(str, runs))}.")
+        raise UserError(f"There are no results yet in {', '.join(map(str, runs))} for {', '.join(policies)}.")
     strips = rollouts.strips_of(runs, results, rollouts_of) if rollouts_of else []
     tables = [make(results) for make in TABLES]
     markdown = "\n".join(table.markdown() for table in tables)

@@ -66,6 +66,11 @@ class Results:
         records = [record for folder in folders for record in folder.records()]
         return cls(first.setting, rows, records), [row for row in found if isinstance(row, CorruptRow)]
 
+    def of(self, policies: Sequence[str]) -> Self:
+        """The results of these policies alone."""
+        rows = (row for row in self.rows if row.cell.policy in policies)
+        return type(self)(self.setting, rows, (self.records[cell] for cell in self.records if cell.policy in policies))
+
     def write(self, folder: Path) -> None:
         """Write all of it into a folder that `read` reads."""
         write_json(folder / "setting.json", self.setting.as_values())
