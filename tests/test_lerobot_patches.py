@@ -1,6 +1,7 @@
 """The changes that this package makes in LeRobot, and their limits."""
 
 import ast
+import importlib
 import json
 import logging
 import pkgutil
@@ -25,7 +26,7 @@ from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
-from lerobot_uca.lerobot_patches import checkpoints, install, messages, reading, recording, settings
+from lerobot_uca.lerobot_patches import install, messages, reading, recording, settings
 from lerobot_uca.policies import precision
 from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
@@ -180,8 +181,9 @@ def test_every_private_name_is_listed():
 def test_every_patched_name_is_listed():
     listed = set(install.USED_NAMES)
     n_patches = 0
-    for module in (checkpoints, settings, reading, recording):
-        nodes = ast.walk(ast.parse(Path(module.__file__).read_text()))
+    for path in Path(install.__file__).parent.glob("*.py"):
+        module = importlib.import_module(f"{install.__package__}.{path.stem}")
+        nodes = ast.walk(ast.parse(path.read_text()))
         calls = [(ast.unparse(node.func), node.args) for node in nodes if isinstance(node, ast.Call)]
         for function, arguments in calls:
             if function in ("replace", "replace_method", "replace_class_method"):

@@ -38,7 +38,7 @@ def report(
     results, corrupt = Results.read(runs)
     for line in corrupt:
         print(f"warning: {line}", file=sys.stderr)
-    results = results.of(policies)
+    results = results.of_policies(policies)
     if not results.rows:
         raise UserError(f"There are no results yet in {', '.join(map(str, runs))} for {', '.join(policies)}.")
     strips = rollouts.strips_of(runs, results, rollouts_of) if rollouts_of else []

@@ -66,7 +66,7 @@ class Results:
         records = [record for folder in folders for record in folder.records()]
         return cls(first.setting, rows, records), [row for row in found if isinstance(row, CorruptRow)]
 
-    def of(self, policies: Sequence[str]) -> Self:
+    def of_policies(self, policies: Sequence[str]) -> Self:
         """The results of these policies alone."""
         rows = (row for row in self.rows if row.cell.policy in policies)
         return type(self)(self.setting, rows, (self.records[cell] for cell in self.records if cell.policy in policies))

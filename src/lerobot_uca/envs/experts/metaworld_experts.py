@@ -1,4 +1,4 @@
-"""Demonstrators of Meta-World's tasks whose own scripted ones fail more often. They are called as Meta-World's are.
+"""Demonstrators of tasks whose own scripted one, Meta-World's, fails more often. They have its interface.
 
 `get_action` maps Meta-World's observation (39,) [m, world frame] to an action (4,): the hand's motion, not yet limited,
 and the gripper's effort, -1 to open it and 1 to close it.
