@@ -181,9 +181,9 @@ def test_every_private_name_is_listed():
 def test_every_patched_name_is_listed():
     listed = set(install.USED_NAMES)
     n_patches = 0
-    for path in Path(install.__file__).parent.glob("*.py"):
-        module = importlib.import_module(f"{install.__package__}.{path.stem}")
-        nodes = ast.walk(ast.parse(path.read_text()))
+    for found in pkgutil.iter_modules([Path(install.__file__).parent]):
+        module = importlib.import_module(f"{install.__package__}.{found.name}")
+        nodes = ast.walk(ast.parse(Path(module.__file__).read_text()))
         calls = [(ast.unparse(node.func), node.args) for node in nodes if isinstance(node, ast.Call)]
         for function, arguments in calls:
             if function in ("replace", "replace_method", "replace_class_method"):

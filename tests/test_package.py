@@ -279,7 +279,7 @@ assert hasattr(factory.LeRobotDataset, "__getitems__")
 """
     result = load(before, after)
     assert result.returncode == 0, result.stderr
-    assert "lerobot_patches.check_settings is missing: AttributeError: module 'lerobot' has no" in result.stderr
+    assert "check_settings is missing: AttributeError: module 'lerobot' has no" in result.stderr
     assert result.stderr.count("is missing") == 1
 
 

@@ -84,16 +84,24 @@ def test_the_expert_succeeds_and_the_episode_can_go_on():
     ("task", "seed"), [("soccer", 0), ("soccer", 1), ("peg-insert-side", 3), ("peg-insert-side", 7)]
 )
 def test_our_experts_succeed_where_metaworlds_fail(task, seed, monkeypatch):
-    """The first failures among the episodes of demonstrations, with straight paths."""
+    """Of the episodes of demonstrations the first in which Meta-World's fail on straight paths."""
 
-    def is_solved():
-        env, expert = MetaworldPointCloudEnv(task, n_points=16), ScriptedExpert(task, straight_paths=True)
+    def n_successful(*, straight_paths):
+        env, expert = MetaworldPointCloudEnv(task, n_points=16), ScriptedExpert(task, straight_paths=straight_paths)
         env.reset(seed=FIRST_SEED + seed)
-        return any(env.act(expert(env))[3]["is_success"] for _ in range(EPISODE_LENGTH))
+        return sum(env.act(expert(env))[3]["is_success"] for _ in range(EPISODE_LENGTH))
 
-    assert is_solved()
+    assert n_successful(straight_paths=True) >= MetaworldPointCloudEnv.min_successful_steps
+    assert n_successful(straight_paths=False) >= MetaworldPointCloudEnv.min_successful_steps
     monkeypatch.setattr(metaworld_experts, "EXPERTS", {})
-    assert not is_solved()
+    assert n_successful(straight_paths=True) == 0
+
+
+def test_it_is_said_whose_expert_demonstrates(caplog):
+    for task in ("soccer", "reach"):
+        config = make_env_config("metaworld_pointcloud", task=task)
+        config.attempts(task, None, 0)
+    assert caplog.messages == ["soccer is demonstrated by this package's expert; Meta-World's fails more often."]
 
 
 def test_rendering_needs_no_opengl(env, monkeypatch):

@@ -58,7 +58,7 @@ def test_a_quarter_turn_to_the_left():
 @pytest.mark.parametrize("task", ["reach", "soccer"])
 @pytest.mark.parametrize("n_steps", [0, 40])  # the motion limited, and not
 def test_a_straight_experts_action_in_a_turned_scene_is_its_action_turned(task, n_steps):
-    """These two steer by where hand, ball and goal are, so in a turned scene they would do what its sample does."""
+    """Both steer by where hand, thing and goal are: in a turned scene they do what training's turned sample does."""
     env = MetaworldPointCloudEnv(task, n_points=16)
     env.reset(seed=4)
     expert = ScriptedExpert(task, straight_paths=True)

@@ -1,5 +1,8 @@
 import errno
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -115,6 +118,29 @@ def test_a_cells_process_that_is_killed_is_recorded_and_the_rest_goes_on(folder,
     output = capsys.readouterr().out
     assert f"[1/2, 0:00 h left] {CELL} FAILED: its process was killed" in output
     assert "finished: 0, failed: 1, being worked on by another process: 1" in output
+
+
+def test_the_minutes_of_a_killed_process_count(folder):
+    """Its last note is at most 10 s old; here 0.02 s, of 0.6."""
+    files = folder.cell(CELL)
+    files.path.mkdir(parents=True)
+    code = f"""
+import os, time
+from pathlib import Path
+from lerobot_uca.protocol import run_cell
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.folder import CellFolder
+run_cell.NOTED_EVERY = 0.02
+with run_cell._minutes(CellFolder(Path({str(folder.path)!r}), {CELL!r}), "training"):
+    time.sleep(0.6)
+    os.kill(os.getpid(), 9)
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -signal.SIGKILL
+    killed = run_cell_module._read_minutes(files, "training")
+    assert killed * 60 > 0.3
+    with run_cell_module._minutes(files, "training"):
+        pass
+    assert run_cell_module._read_minutes(files, "training") >= killed
 
 
 def test_any_exception_concerns_one_cell(folder, monkeypatch):

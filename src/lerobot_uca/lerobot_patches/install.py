@@ -82,4 +82,5 @@ def _install_conveniences() -> None:
         try:
             patch()
         except Exception as error:  # noqa: BLE001 (one that fails must not take the others down)
-            logger.warning("lerobot_patches.%s is missing: %s: %s", patch.__name__, type(error).__name__, error)
+            name = f"{patch.__module__}.{patch.__name__}"
+            logger.warning("%s is missing: %s: %s", name, type(error).__name__, error)

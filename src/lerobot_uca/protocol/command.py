@@ -120,7 +120,7 @@ def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
 def _report(args: argparse.Namespace) -> None:
     tasks = resolve_tasks("all", args.rollouts) if args.rollouts is not None else ()
     policies = resolve_policies(args.policies)
-    print(report(args.runs, args.output, policies, as_html=args.html, rollouts_of=tasks))
+    print(report(args.runs, args.output, as_html=args.html, policies=policies, rollouts_of=tasks))
     print(f"Written to {args.output}.", file=sys.stderr)
 
 

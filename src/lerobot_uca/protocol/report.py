@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import rollouts
+from lerobot_uca.protocol.cells import POLICIES
 from lerobot_uca.protocol.figures import CAPTIONS, draw
 from lerobot_uca.protocol.results import Results
 from lerobot_uca.protocol.tables import TABLES, setting_of
@@ -21,15 +22,20 @@ tbody tr:hover { background: #f3f6fa } svg { max-width: 100%; height: auto }
 
 
 def report(
-    runs: Sequence[Path], output: Path, policies: Sequence[str], *, as_html: bool, rollouts_of: Sequence[str] = ()
+    runs: Sequence[Path],
+    output: Path,
+    *,
+    as_html: bool,
+    policies: Sequence[str] = tuple(POLICIES),
+    rollouts_of: Sequence[str] = (),
 ) -> str:
     """Write tables (Markdown, CSV, LaTeX), figures (PNG, SVG) and the results themselves; the tables as Markdown.
 
     Args:
         runs: folders of runs or reports.
         output: folder to write.
-        policies: those to report.
         as_html: whether to write one page as well.
+        policies: those to report.
         rollouts_of: tasks of which an episode of each policy is shown; for that it is run again.
 
     Raises:

@@ -8,10 +8,11 @@ import json
 import logging
 import shutil
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import IntEnum
 from io import TextIOWrapper
 from pathlib import Path
@@ -24,6 +25,7 @@ from lerobot_uca.protocol.folder import CellFolder, RunFolder, write_json
 from lerobot_uca.protocol.rows import CorruptRow, Row, read_rows, write_rows
 from lerobot_uca.protocol.tied import tie_to_parent
 from lerobot_uca.protocol.training import CellError, NoSpaceError, no_space_as_such
+from lerobot_uca.whole_file import whole_file
 
 if TYPE_CHECKING:
     from lerobot_uca.envs.point_cloud_env import PointCloudEnv
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 N_ENVS = 10
 """Episodes at once: enough to share the policy's calls."""
+NOTED_EVERY = 10.0
+"""Seconds between two notes of how long a phase has taken."""
 
 
 class Outcome(IntEnum):
@@ -168,13 +172,26 @@ def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
 
 @contextmanager
 def _minutes(files: CellFolder, phase: str) -> Iterator[None]:
-    """Add the time of a phase to what earlier processes of this cell have needed for it."""
-    begin = time.monotonic()
+    """Add the time of a phase to what earlier processes of this cell have needed for it, also if this one is killed."""
+    before, begin = _read_minutes(files, phase), time.monotonic()
+
+    def note() -> None:
+        with suppress(OSError), whole_file(files.path / f"{phase}_minutes.txt") as unfinished:
+            unfinished.write_text(f"{before + (time.monotonic() - begin) / 60:.3f}\n", encoding="utf-8")
+
+    def keep_noting() -> None:
+        while not is_over.wait(NOTED_EVERY):
+            note()
+
+    is_over = threading.Event()
+    notes = threading.Thread(target=keep_noting, daemon=True)
+    notes.start()
     try:
         yield
     finally:
-        path = files.path / f"{phase}_minutes.txt"
-        path.write_text(f"{_read_minutes(files, phase) + (time.monotonic() - begin) / 60:.3f}\n", encoding="utf-8")
+        is_over.set()
+        notes.join()
+        note()
 
 
 def _read_minutes(files: CellFolder, phase: str) -> float:
