@@ -247,6 +247,7 @@ def test_bfloat16_is_for_processors_that_have_it(monkeypatch, caplog, dataset_ro
         config.validate()
         return config.policy.dtype
 
+    caplog.set_level(logging.WARNING)
     assert dtype(is_there=True) == "bfloat16"
     assert not caplog.messages
     assert dtype(is_there=False) == "float32"

@@ -108,8 +108,10 @@ class RtdeProcess:
             age = time.monotonic() - self._heard_at
             if age < HEARTBEAT_TIMEOUT:
                 return self._state
+            # Whoever asks from now on is told this, not that the process was killed.
+            self._failure = f"The process that talks to the arm has not been heard for {age:.1f} s and was ended."
         self.kill()  # the controller's watchdog then ends its program
-        raise ArmStoppedError(f"The process that talks to the arm has not been heard for {age:.1f} s and was ended.")
+        raise ArmStoppedError(self._failure)
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
