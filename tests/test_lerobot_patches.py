@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from accelerate import accelerator
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -180,6 +181,7 @@ def test_every_private_name_is_listed():
 
 def test_every_patched_name_is_listed():
     listed = set(install.USED_NAMES)
+    names = {"evaluation": lerobot_eval, "accelerate": accelerator}
     n_patches = 0
     for found in pkgutil.iter_modules([Path(install.__file__).parent]):
         module = importlib.import_module(f"{install.__package__}.{found.name}")
@@ -187,7 +189,7 @@ def test_every_patched_name_is_listed():
         calls = [(ast.unparse(node.func), node.args) for node in nodes if isinstance(node, ast.Call)]
         for function, arguments in calls:
             if function in ("replace", "replace_method", "replace_class_method"):
-                target = eval(ast.unparse(arguments[0]), {**vars(module), "evaluation": lerobot_eval})
+                target = eval(ast.unparse(arguments[0]), {**vars(module), **names})
                 method = f".{arguments[1].value}" if function != "replace" else ""
                 assert f"{target.__module__}.{target.__qualname__}{method}" in listed
                 n_patches += 1
@@ -259,6 +261,7 @@ def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch
     mine = ContextVar("evaluated_observation", default="point_cloud")
     for module in (recording, settings):
         monkeypatch.setattr(module, "evaluated_observation", mine)
+    recording.record_what_can_be_trained()  # as when lerobot-eval loads the plugin
     clouds, objects = (MetaworldPointCloudConfig(observation=name) for name in ("point_cloud", "object_cloud"))
     UCAFlowPolicy(make_config(observation="object_cloud")).save_pretrained(tmp_path / "policy")
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", f"--policy.path={tmp_path / 'policy'}"])

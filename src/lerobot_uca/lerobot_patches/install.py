@@ -11,6 +11,7 @@ from lerobot_uca.lerobot_patches.checkpoints import (
     resume_exactly,
     save_checkpoints_whole,
 )
+from lerobot_uca.lerobot_patches.ending import end_together
 from lerobot_uca.lerobot_patches.messages import report_user_errors, shorten_decoder_warning
 from lerobot_uca.lerobot_patches.reading import normalise_what_is_trained, read_in_batches
 from lerobot_uca.lerobot_patches.recording import record_what_can_be_trained
@@ -20,6 +21,7 @@ from lerobot_uca.processes import end_by_signals
 
 USED_NAMES = (
     # Private names and functions without a promise: a port to another LeRobot starts here.
+    "accelerate.accelerator.Accelerator.end_training",
     "lerobot.common.train_utils.load_training_state",
     "lerobot.common.train_utils.push_checkpoint_to_hub",
     "lerobot.common.train_utils.save_checkpoint",
@@ -75,6 +77,7 @@ def _install_conveniences() -> None:
             save_checkpoints_whole,
             resume_exactly,
             report_failed_uploads,
+            end_together,
             normalise_what_is_trained,
             record_what_can_be_trained,
         ]
