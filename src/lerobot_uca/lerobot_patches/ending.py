@@ -10,11 +10,11 @@ from torch import distributed
 from lerobot_uca.lerobot_patches.replacing import replace_method
 
 RELEASE_TIME = 0.5
-"""Seconds for PyTorch's thread to release the last barrier; it takes well under a millisecond where a core is free."""
+"""Seconds for PyTorch's thread to release the last barrier."""
 
 
 def end_together() -> None:
-    """Processes that train on CPUs end. Without it one of them hangs now and then when all is saved (PyTorch 2.11).
+    """Processes that train on CPUs end. Without it one was seen to hang when all was saved (PyTorch 2.11).
 
     LeRobot waits at a barrier and ends. Gloo's thread has then to release the barrier's tensors, which takes Python's
     lock; the main thread holds that lock while it waits for gloo's thread to end.
