@@ -70,6 +70,13 @@ def test_what_is_not_there(checkpoint, dataset_root, tmp_path):
         moments_of(tmp_path / "none", dataset_root, episode=0)
 
 
+def test_clouds_of_another_kind_than_trainings(policy, checkpoint, dataset_root):
+    policy.config.observation = "object_cloud"
+    policy.config.save_pretrained(checkpoint)
+    with pytest.raises(UserError, match=r"trained on clouds of env\.observation=object_cloud, .* has point_cloud\."):
+        moments_of(checkpoint, dataset_root, episode=0)
+
+
 def test_every_ablation_has_saliency():
     for conditioning in ("cross_attention", "adaln"):
         policy = UCAFlowPolicy(make_config(conditioning=conditioning)).eval()

@@ -21,7 +21,7 @@ from torch.utils.data import default_collate
 
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 from lerobot_uca.whole_file import whole_file
@@ -62,13 +62,19 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
     """Moments of a dataset's episode, evenly spaced.
 
     Raises:
-        UserError: if the checkpoint is not one of this package, or there is no such episode.
+        UserError: if the checkpoint is not one of this package, there is no such episode, or one of policy and
+            dataset has the robot's own points and the other does not.
     """
     policy, preprocess, postprocess = _load(checkpoint)
     config = policy.config
     dataset = BatchedDataset(f"local/{dataset_root.name}", root=dataset_root)
     if not 0 <= episode < dataset.num_episodes:
         raise UserError(f"--episode must be 0 to {dataset.num_episodes - 1}, got {episode}.")
+    given = cloud_observation(dataset.meta.features)
+    if given != config.observation:
+        raise UserError(
+            f"'{checkpoint}' was trained on clouds of env.observation={config.observation}, '{dataset_root}' has {given}."
+        )
     seconds = [step / dataset.fps for step in config.observation_delta_indices]
     windows = dict.fromkeys((OBS_POINT_CLOUD, OBS_STATE), seconds)
     dataset = BatchedDataset(dataset.repo_id, root=dataset_root, delta_timestamps=windows)
