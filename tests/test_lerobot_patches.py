@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from accelerate import accelerator
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -254,6 +255,38 @@ def test_bfloat16_is_for_processors_that_have_it(monkeypatch, caplog, dataset_ro
     assert not caplog.messages
     assert dtype(is_there=False) == "float32"
     assert caplog.messages == ["This processor has no instructions for policy.dtype=bfloat16: training is in float32."]
+
+
+def test_an_option_that_cannot_be_is_not_the_checkpoints_fault(tmp_path):
+    UCAFlowPolicy(make_config()).save_pretrained(tmp_path)
+
+    def load(*options: str) -> PreTrainedConfig:
+        return PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=list(options))
+
+    assert load("--use_amp=true", "--n_action_steps=2").n_action_steps == 2
+    with pytest.raises(UserError, match=r"^One of .* policy\.use_amp=maybe, policy\.dim=8: .*`use_amp`.*'maybe'"):
+        load("--use_amp=maybe", "--dim=8")
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(UserError, match="does not hold a policy that can be loaded: JSONDecodeError"):
+        load("--use_amp=maybe")
+
+
+def test_an_evaluation_imitates_no_bfloat16(monkeypatch, caplog, tmp_path):
+    UCAFlowPolicy(make_config()).save_pretrained(tmp_path / "policy")
+
+    def use_amp(*, wanted: bool, is_there: bool) -> bool:
+        monkeypatch.setattr(precision, "has_bfloat16", lambda device: is_there)
+        options = [f"--policy.path={tmp_path / 'policy'}", f"--policy.use_amp={str(wanted).lower()}"]
+        monkeypatch.setattr(sys, "argv", ["lerobot-eval", *options])
+        return EvalPipelineConfig(env=MetaworldPointCloudConfig(), output_dir=tmp_path / "eval").policy.use_amp
+
+    caplog.set_level(logging.WARNING, logger=precision.__name__)
+    assert use_amp(wanted=True, is_there=True)
+    assert not use_amp(wanted=False, is_there=False)
+    line = "This processor has no instructions for policy.use_amp=true: the evaluation is in float32."
+    assert line not in caplog.messages
+    assert not use_amp(wanted=True, is_there=False)
+    assert line in caplog.messages
 
 
 def test_an_evaluation_in_clouds_other_than_the_trainings_is_refused(monkeypatch, dataset_root, tmp_path):

@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -57,12 +57,22 @@ def make_registered_steps_only() -> None:
 
 
 def report_damaged_checkpoints() -> None:
-    """One line names the missing or damaged part. LeRobot shows a library's traceback."""
+    """One line names the missing or damaged part, or the option that cannot be. LeRobot shows a library's traceback."""
 
     def policy(load: Callable[..., Any]) -> Callable[..., Any]:
-        def from_pretrained(cls: type, pretrained_name_or_path: Path | str, **kwargs: Any) -> Any:
+        def from_pretrained(
+            cls: type, pretrained_name_or_path: Path | str, cli_overrides: Sequence[str] | None = (), **kwargs: Any
+        ) -> Any:
             with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded"):
-                return load(cls, pretrained_name_or_path, **kwargs)
+                try:
+                    return load(cls, pretrained_name_or_path, cli_overrides=cli_overrides, **kwargs)
+                except Exception:
+                    if not cli_overrides:
+                        raise
+                    load(cls, pretrained_name_or_path, **kwargs)  # to see whether the checkpoint is at fault
+            options = ", ".join(f"policy.{option.lstrip('-')}" for option in cli_overrides)
+            with reported(f"One of the options cannot be set to its value, {options}"):
+                return load(cls, pretrained_name_or_path, cli_overrides=cli_overrides, **kwargs)
 
         return from_pretrained
 

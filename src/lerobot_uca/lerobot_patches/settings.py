@@ -14,7 +14,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.lerobot_patches.recording import evaluated_observation
 from lerobot_uca.lerobot_patches.replacing import replace_class_method, replace_method
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
-from lerobot_uca.policies.precision import dtype_of_training
+from lerobot_uca.policies.precision import amp_of_evaluation, dtype_of_training
 
 
 def check_settings() -> None:
@@ -57,6 +57,7 @@ def check_settings() -> None:
 def _check_evaluation(config: EvalPipelineConfig, policy: PointCloudPolicyConfig) -> None:
     check_output_folder(config.output_dir)
     policy.check_environment(config.env)
+    policy.use_amp = amp_of_evaluation(policy.use_amp, policy.device)
     evaluated_observation.set(policy.observation)
 
 

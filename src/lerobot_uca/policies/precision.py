@@ -21,6 +21,19 @@ def dtype_of_training(dtype: str, device: str) -> str:
     return dtype
 
 
+def amp_of_evaluation(use_amp: bool, device: str) -> bool:
+    """Whether to evaluate with LeRobot's use_amp: not on a CPU that only imitates bfloat16, which autocast computes in.
+
+    Args:
+        use_amp: whether that is wanted.
+        device: PyTorch's name of it.
+    """
+    if use_amp and torch.device(device).type == "cpu" and not has_bfloat16(device):
+        logger.warning("This processor has no instructions for policy.use_amp=true: the evaluation is in float32.")
+        return False
+    return use_amp
+
+
 def has_bfloat16(device: str) -> bool:
     """Whether a device has instructions for bfloat16. Without them PyTorch imitates it.
 

@@ -73,7 +73,8 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
     given = cloud_observation(dataset.meta.features)
     if given != config.observation:
         raise UserError(
-            f"'{checkpoint}' was trained on clouds of env.observation={config.observation}, '{dataset_root}' has {given}."
+            f"'{checkpoint}' was trained on clouds of env.observation={config.observation}, "
+            f"'{dataset_root}' has {given}."
         )
     seconds = [step / dataset.fps for step in config.observation_delta_indices]
     windows = dict.fromkeys((OBS_POINT_CLOUD, OBS_STATE), seconds)
