@@ -62,16 +62,16 @@ class CollectConfig:
     smoothing: float = 1.0
     # Horizontally the hand goes straight to where the expert wants it, equally fast in all directions. By default x and
     # y are limited one by one, as in the papers: far from its aim the hand goes diagonally, the last part along one
-    # axis. With --policy.scene_turn a straight motion still fits when it is turned (docs/results.md). Meta-World alone.
+    # axis. With --policy.scene_turn a straight motion still fits when it is turned (docs/recipe.md). Meta-World alone.
     straight_paths: bool = False
     # Probability, in each step, that something begins to push the hand, for 5 to 10 steps in a random direction, and in
     # one of three pushes the gripper as well. The dataset holds what the expert would have done, so it shows how to
-    # recover, which helps some tasks and harms others (docs/results.md). 0 leaves the expert undisturbed, as in the
+    # recover, which helps some tasks and harms others (docs/recipe.md). 0 leaves the expert undisturbed, as in the
     # papers.
     pushes: float = 0.0
     # A demonstration ends after so many successful steps. By default it goes on to the end of the episode, as the
     # baselines' do, so half of a dataset may show what happens after the success, where nothing is left to learn: with
-    # 10, Meta-World's tasks are solved more often in the mean (docs/results.md).
+    # 10, Meta-World's tasks are solved more often in the mean (docs/recipe.md).
     successful_steps: int | None = within(None, least=1, most=1_000_000)
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)

@@ -33,7 +33,7 @@ class SceneTurnConfig:
     """Training's scenes turned about the vertical through the hand: the cloud, the robot's state and its motion.
 
     An arm moves alike in all horizontal directions, so ten demonstrations show where to go from there, too. Off by
-    default; needs policy.hand_position. What it did to success stands in docs/results.md.
+    default; needs policy.hand_position. What it did to success stands in docs/recipe.md.
     """
 
     # Largest turn [deg], to either side; each sample's is drawn.

@@ -46,7 +46,7 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     c: float = within(1e-3, above=0)
     # t and r are two draws from sigmoid(N(interval_mean, interval_std^2)); MP1's values. They rarely draw the whole
     # interval [0, 1], which is what one step needs: a wider distribution got further in short trainings
-    # (docs/results.md).
+    # (docs/recipe.md).
     interval_mean: float = within(-0.4, least=-10, most=10)
     # See interval_mean.
     interval_std: float = within(1.0, above=0, most=10)
