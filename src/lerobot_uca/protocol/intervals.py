@@ -1,6 +1,6 @@
-"""Rates and their intervals, by formulas and a bootstrap of our own.
+"""Rates and their intervals.
 
-Letters: S training seeds, N episodes, D draws. Rates and intervals are shares of 1.
+Letters: N episodes. Rates and intervals are shares of 1.
 """
 
 import math
@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 Z_95 = 1.959963984540054  # of the standard normal distribution
-N_DRAWS = 4000
 
 Successes = Sequence[NDArray[np.int64]]
 """Episodes of each training seed of a task, (N,): 1 a success, 0 a failure; or differences of two policies."""
@@ -42,27 +42,33 @@ def wilson(n_successes: int, n_episodes: int) -> Estimate:
     return Estimate(rate, min(rate, max(0.0, centre - half)), max(rate, min(1.0, centre + half)))
 
 
-def mean_over_tasks(tasks: Sequence[Successes], *, n_draws: int = N_DRAWS) -> Estimate:
-    """The mean over tasks of the mean over seeds of the mean over episodes, with a bootstrap interval.
+def mean_over_tasks(tasks: Sequence[Successes], bounds: tuple[float, float] = (0.0, 1.0)) -> Estimate:
+    """The mean over tasks of the mean over seeds of the mean over episodes, with Student's interval.
 
-    Stratified by task: each draw holds every task once, with its seeds drawn anew and, of each, its episodes. With one
-    seed the interval shows only what other episodes would change, not what another training would.
+    Stratified by task. A task's variance is that between its seeds, with their episodes' chance in it, or that of their
+    episodes alone where the seeds happen to differ less. With one seed the interval shows only what other episodes
+    would change, not what another training would. The degrees of freedom are Welch's and Satterthwaite's.
+
+    Args:
+        tasks: at least one, each with at least one seed.
+        bounds: what a mean can be: 0 to 1 of rates, -1 to 1 of differences.
     """
-    rng = np.random.default_rng(0)
-    means = [np.mean([np.mean(seed) for seed in seeds]) for seeds in tasks]
-    drawn = np.mean([_draw_task(rng, seeds, n_draws) for seeds in tasks], axis=0)  # (D,)
-    low, high = np.quantile(drawn, (0.025, 0.975))
-    return Estimate(float(np.mean(means)), float(low), float(high))
+    mean = float(np.mean([np.mean([seed.mean() for seed in seeds]) for seeds in tasks]))
+    parts = [_variance(seeds) for seeds in tasks]
+    variance = sum(part for part, _ in parts)
+    if variance == 0:
+        return Estimate(mean, mean, mean)
+    freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
+    half = float(stdtrit(freedom, 0.975)) * math.sqrt(variance) / len(tasks)
+    return Estimate(mean, max(bounds[0], mean - half), min(bounds[1], mean + half))
 
 
-def _draw_task(rng: np.random.Generator, seeds: Successes, n_draws: int) -> NDArray[np.float64]:
-    """Means (D,) of a task whose seeds and episodes are drawn with replacement.
-
-    To draw N episodes is to draw how often each value occurs: -1, 0 and 1 are the only ones.
-    """
-    values = np.array([-1, 0, 1])
-    shares = np.array([[np.mean(seed == value) for value in values] for seed in seeds])  # (S, 3)
-    n_episodes = np.array([len(seed) for seed in seeds])
-    which = rng.integers(len(seeds), size=(n_draws, len(seeds)))
-    counts = rng.multinomial(n_episodes[which], shares[which])  # (D, S, 3)
-    return (counts @ values / n_episodes[which]).mean(axis=1)
+def _variance(seeds: Successes) -> tuple[float, int]:
+    """The variance of a task's mean over seeds, and its degrees of freedom."""
+    of_episodes = float(
+        np.mean([np.square(seed - seed.mean()).sum() / max(1, len(seed) - 1) / len(seed) for seed in seeds])
+    )
+    of_seeds = float(np.var([seed.mean() for seed in seeds], ddof=1)) if len(seeds) > 1 else 0.0
+    if of_seeds > of_episodes:
+        return of_seeds / len(seeds), len(seeds) - 1
+    return of_episodes / len(seeds), max(1, sum(len(seed) - 1 for seed in seeds))

@@ -102,7 +102,7 @@ class Results:
         ]
 
     def honest(self, tasks: Sequence[str], policy: str) -> Estimate | None:
-        """Success on those of the tasks that are there: Wilson's interval for one task, else the bootstrap's."""
+        """Success on those of the tasks that are there: Wilson's interval for one task, else Student's."""
         there = [successes for task in tasks if (successes := self.successes(task, policy))]
         if not there:
             return None
@@ -117,7 +117,7 @@ class Results:
         Paired by task, training seed and episode.
         """
         paired = {task: pairs for task in tasks if (pairs := self._pairs(task, policy, other))}
-        return (mean_over_tasks(list(paired.values())), list(paired)) if paired else None
+        return (mean_over_tasks(list(paired.values()), bounds=(-1, 1)), list(paired)) if paired else None
 
     def _pairs(self, task: str, policy: str, other: str) -> list[NDArray[np.int64]]:
         pairs = []
