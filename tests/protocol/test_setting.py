@@ -5,6 +5,7 @@ import yaml
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import POLICIES, SUITES, Cell
+from lerobot_uca.protocol.folder import RunFolder
 from lerobot_uca.protocol.setting import FIRST_TUNING_SEED, Setting
 
 PEN, DOOR, REACH = (Cell(task, "uca_flow", 0) for task in ("adroit/pen", "adroit/door", "metaworld/reach"))
@@ -62,8 +63,8 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ("text", "may hold description, batch_size,"),
-        ({**GOOD, "batchsize": 8}, "may hold description, batch_size"),
+        ("text", "may hold name, description, batch_size,"),
+        ({**GOOD, "batchsize": 8}, "may hold name, description, batch_size"),
         ({"batch_size": 8}, "is not complete"),
         ({**GOOD, "batch_size": 0}, "batch_size must be a whole number above 0, got 0"),
         ({**GOOD, "lengths": {"metaworld": {"steps": 5, "evaluations": 2}}}, "must be a multiple of its evaluations"),
@@ -108,8 +109,16 @@ def test_a_wrong_file(tmp_path, values, message):
 
 
 def test_an_unknown_setting():
-    with pytest.raises(UserError, match=r"Unknown setting 'big'. Settings: paper, small, or a YAML file's path."):
+    with pytest.raises(UserError, match=r"Unknown setting 'big'. Settings: paper, small, or a file's path."):
         Setting.load("big")
+
+
+def test_a_runs_setting_json_is_a_setting(tmp_path):
+    """So that results say how to make them again."""
+    made = RunFolder.create(tmp_path / "run", Setting.load("small"))
+    assert (
+        Setting.load(str(tmp_path / "run" / "setting.json")) == made.setting == RunFolder.open(tmp_path / "run").setting
+    )
 
 
 def test_a_task_without_length(tmp_path):

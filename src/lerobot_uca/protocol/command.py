@@ -53,7 +53,9 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     parser.add_argument("--tasks", help="tasks or groups out of the suite, separated by commas (default: all)")
     parser.add_argument("--policies", default="uca_flow", help="separated by commas (default: uca_flow)")
     parser.add_argument("--seeds", default="0,1,2", help="of training; 100 and up are for tuning (default: 0,1,2)")
-    parser.add_argument("--setting", default="small", help="small, paper, or a YAML file's path (default: small)")
+    parser.add_argument(
+        "--setting", default="small", help="small, paper, a YAML file, or a run's setting.json (default: small)"
+    )
     parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
     parser.add_argument("--parallel", type=int, default=n_cores(), help="cells at once (default: one a core)")
     where = parser.add_mutually_exclusive_group()

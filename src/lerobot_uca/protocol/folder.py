@@ -94,9 +94,7 @@ class RunFolder:
         file = path / "setting.json"
         if not file.is_file():
             raise UserError(f"'{path}' is not the folder of a benchmark run: it has no setting.json.")
-        values = _read_json(file)
-        name = values.pop("name") if isinstance(values, dict) and "name" in values else path.name
-        return cls(path, Setting.from_values(name, values))
+        return cls(path, Setting.from_values(path.name, _read_json(file)))
 
     def cell(self, cell: Cell) -> CellFolder:
         """The files of a cell."""

@@ -105,7 +105,7 @@ class Setting:
 
     @classmethod
     def load(cls, name: str) -> Self:
-        """The setting of a name, or of a YAML file's path.
+        """The setting of a name, or of the path of a YAML file or a run's setting.json.
 
         Raises:
             UserError: if there is none, or it does not hold what a setting holds.
@@ -113,7 +113,7 @@ class Setting:
         known = {Path(file.name).stem: file for file in FOLDER.iterdir() if file.name.endswith(".yaml")}
         path = Path(name)
         if name not in known and not path.is_file():
-            raise UserError(f"Unknown setting '{name}'. Settings: {', '.join(sorted(known))}, or a YAML file's path.")
+            raise UserError(f"Unknown setting '{name}'. Settings: {', '.join(sorted(known))}, or a file's path.")
         try:
             values = yaml.safe_load(known.get(name, path).read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -122,14 +122,14 @@ class Setting:
 
     @classmethod
     def from_values(cls, name: str, values: Any) -> Self:
-        """Make a setting of a YAML file's values."""
-        valid = [each.name for each in fields(cls) if each.name != "name"]
+        """Make a setting of a file's values, which may hold another name than the file's."""
+        valid = [each.name for each in fields(cls)]
         if not isinstance(values, dict) or not set(values) <= set(valid):
             got = ", ".join(map(str, values)) if isinstance(values, dict) else type(values).__name__
             raise UserError(f"Setting '{name}' may hold {', '.join(valid)}, got {got}.")
         try:
             lengths = {key: Length(**length) for key, length in values["lengths"].items()}
-            setting = cls(**{**values, "name": name, "lengths": lengths})
+            setting = cls(**{"name": name, **values, "lengths": lengths})
         except (KeyError, TypeError, AttributeError) as error:
             raise UserError(f"Setting '{name}' is not complete: {error}.") from error
         setting.check()
