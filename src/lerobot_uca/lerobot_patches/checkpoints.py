@@ -7,6 +7,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+from draccus.utils import DecodingError
 from lerobot.common import train_utils
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import factory as policy_factory
@@ -66,7 +67,7 @@ def report_damaged_checkpoints() -> None:
             with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded"):
                 try:
                     return load(cls, pretrained_name_or_path, cli_overrides=cli_overrides, **kwargs)
-                except Exception:
+                except DecodingError:
                     if not cli_overrides:
                         raise
                     load(cls, pretrained_name_or_path, **kwargs)  # to see whether the checkpoint is at fault
