@@ -266,6 +266,10 @@ def test_an_option_that_cannot_be_is_not_the_checkpoints_fault(tmp_path):
     assert load("--use_amp=true", "--n_action_steps=2").n_action_steps == 2
     with pytest.raises(UserError, match=r"^One of .* policy\.use_amp=maybe, policy\.dim=8: .*`use_amp`.*'maybe'"):
         load("--use_amp=maybe", "--dim=8")
+    whole = (tmp_path / "config.json").read_text()
+    (tmp_path / "config.json").write_text(whole.replace('"use_amp": false', '"use_amp": "maybe"'))
+    with pytest.raises(UserError, match="does not hold a policy that can be loaded: DecodingError: `use_amp`"):
+        load("--dim=8")
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(UserError, match="does not hold a policy that can be loaded: JSONDecodeError"):
         load("--use_amp=maybe")

@@ -115,7 +115,7 @@ def test_an_unknown_setting():
 
 def test_a_runs_setting_json_is_a_setting(tmp_path):
     """So that results say how to make them again."""
-    made = RunFolder.create(tmp_path / "run", Setting.load("small"))
+    made = RunFolder.create(tmp_path / "run", Setting.from_values("mine", {**GOOD, "policy": {"optimizer_lr": 5e-5}}))
     assert (
         Setting.load(str(tmp_path / "run" / "setting.json")) == made.setting == RunFolder.open(tmp_path / "run").setting
     )

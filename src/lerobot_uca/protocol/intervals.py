@@ -1,6 +1,6 @@
 """Rates and their intervals.
 
-Letters: N episodes. Rates and intervals are shares of 1.
+Letters: S training seeds, N episodes. Rates and intervals are shares of 1.
 """
 
 import math
@@ -13,8 +13,8 @@ from scipy.special import stdtrit
 
 Z_95 = 1.959963984540054  # of the standard normal distribution
 
-Successes = Sequence[NDArray[np.int64]]
-"""Episodes of each training seed of a task, (N,): 1 a success, 0 a failure; or differences of two policies."""
+Successes = NDArray[np.int64]
+"""Of a task (S, N), S training seeds in the same N episodes: 1 a success, 0 a failure; or two policies' differences."""
 
 
 class Estimate(NamedTuple):
@@ -30,12 +30,13 @@ class Estimate(NamedTuple):
         return self.low > 0 or self.high < 0
 
 
-def wilson(n_successes: int, n_episodes: int) -> Estimate:
+def wilson(rate: float, n_episodes: int) -> Estimate:
     """A success rate with Wilson's interval, which stays inside [0, 1] also at 0 and 1.
 
-    It is that of independent episodes: of one training, or of several taken together.
+    It is that of independent episodes. Trainings that are evaluated in the same episodes add none: their mean rate has
+    at most this interval, as far as episodes go.
     """
-    rate, squared = n_successes / n_episodes, Z_95**2
+    squared = Z_95**2
     centre = (rate + squared / (2 * n_episodes)) / (1 + squared / n_episodes)
     spread = rate * (1 - rate) / n_episodes + squared / (4 * n_episodes**2)
     half = Z_95 * math.sqrt(spread) / (1 + squared / n_episodes)
@@ -43,18 +44,18 @@ def wilson(n_successes: int, n_episodes: int) -> Estimate:
 
 
 def mean_over_tasks(tasks: Sequence[Successes], bounds: tuple[float, float] = (0.0, 1.0)) -> Estimate:
-    """The mean over tasks of the mean over seeds of the mean over episodes, with Student's interval.
+    """The mean over tasks of the mean over seeds and episodes, with Student's interval.
 
-    Stratified by task. A task's variance is that between its seeds, with their episodes' chance in it, or that of their
-    episodes alone where the seeds happen to differ less. With one seed the interval shows only what other episodes
-    would change, not what another training would. The degrees of freedom are Welch's and Satterthwaite's.
+    Stratified by task. Episodes and seeds are crossed: the mean would be another with other episodes, which all seeds
+    share, and with other seeds. Of one seed only the episodes' part is known. The degrees of freedom are Welch's and
+    Satterthwaite's. Where no episode and no seed differs from another, as at 100 %, the interval has no width.
 
     Args:
-        tasks: at least one, each with at least one seed.
+        tasks: at least one.
         bounds: what a mean can be: 0 to 1 of rates, -1 to 1 of differences.
     """
-    mean = float(np.mean([np.mean([seed.mean() for seed in seeds]) for seeds in tasks]))
-    parts = [_variance(seeds) for seeds in tasks]
+    mean = float(np.mean([successes.mean() for successes in tasks]))
+    parts = [part for successes in tasks for part in _variances(successes)]
     variance = sum(part for part, _ in parts)
     if variance == 0:
         return Estimate(mean, mean, mean)
@@ -63,12 +64,15 @@ def mean_over_tasks(tasks: Sequence[Successes], bounds: tuple[float, float] = (0
     return Estimate(mean, max(bounds[0], mean - half), min(bounds[1], mean + half))
 
 
-def _variance(seeds: Successes) -> tuple[float, int]:
-    """The variance of a task's mean over seeds, and its degrees of freedom."""
-    of_episodes = float(
-        np.mean([np.square(seed - seed.mean()).sum() / max(1, len(seed) - 1) / len(seed) for seed in seeds])
-    )
-    of_seeds = float(np.var([seed.mean() for seed in seeds], ddof=1)) if len(seeds) > 1 else 0.0
-    if of_seeds > of_episodes:
-        return of_seeds / len(seeds), len(seeds) - 1
-    return of_episodes / len(seeds), max(1, sum(len(seed) - 1 for seed in seeds))
+def _variances(successes: Successes) -> list[tuple[float, int]]:
+    """The variance of a task's mean over other episodes and over other seeds, each with its degrees of freedom."""
+    n_seeds, n_episodes = successes.shape
+    by_episode, by_seed = successes.mean(axis=0), successes.mean(axis=1)
+    free = max(1, n_episodes - 1)
+    episodes = float(np.square(by_episode - by_episode.mean()).sum()) / free / n_episodes
+    if n_seeds == 1:
+        return [(episodes, free)]
+    rest = successes - by_episode - by_seed[:, None] + successes.mean()
+    chance = float(np.square(rest).sum()) / free / (n_seeds - 1) / successes.size  # is in both
+    seeds = float(np.var(by_seed, ddof=1)) / n_seeds
+    return [(episodes, free), (max(0.0, seeds - chance), n_seeds - 1)]

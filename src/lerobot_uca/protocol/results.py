@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import POLICIES, Cell
@@ -94,21 +93,17 @@ class Results:
 
     # The honest rule: the last checkpoint, fresh episodes. ------------------------------------------------------
 
-    def successes(self, task: str, policy: str) -> Successes:
-        """The last checkpoints' successes in fresh episodes, for each training seed."""
-        return [
-            np.array([int(success) for success in self._final[Cell(task, policy, seed)].values()])
-            for seed in self.seeds(task, policy)
-        ]
+    def successes(self, task: str, policy: str) -> Successes | None:
+        """The last checkpoints' successes in the fresh episodes that all training seeds have, if there are any."""
+        return _aligned([self._final[Cell(task, policy, seed)] for seed in self.seeds(task, policy)])
 
     def honest(self, tasks: Sequence[str], policy: str) -> Estimate | None:
         """Success on those of the tasks that are there: Wilson's interval for one task, else Student's."""
-        there = [successes for task in tasks if (successes := self.successes(task, policy))]
+        there = [found for task in tasks if (found := self.successes(task, policy)) is not None]
         if not there:
             return None
         if len(tasks) == 1:
-            episodes = np.concatenate(there[0])
-            return wilson(int(episodes.sum()), len(episodes))
+            return wilson(float(there[0].mean()), there[0].shape[1])
         return mean_over_tasks(there)
 
     def difference(self, policy: str, other: str, tasks: Sequence[str]) -> tuple[Estimate, list[str]] | None:
@@ -116,17 +111,13 @@ class Results:
 
         Paired by task, training seed and episode.
         """
-        paired = {task: pairs for task in tasks if (pairs := self._pairs(task, policy, other))}
+        paired = {task: pairs for task in tasks if (pairs := self._pairs(task, policy, other)) is not None}
         return (mean_over_tasks(list(paired.values()), bounds=(-1, 1)), list(paired)) if paired else None
 
-    def _pairs(self, task: str, policy: str, other: str) -> list[NDArray[np.int64]]:
-        pairs = []
-        for seed in self.seeds(task, policy):
-            first, second = (self._final.get(Cell(task, name, seed), {}) for name in (policy, other))
-            common = first.keys() & second.keys()
-            if common:
-                pairs.append(np.array([int(first[episode]) - int(second[episode]) for episode in sorted(common)]))
-        return pairs
+    def _pairs(self, task: str, policy: str, other: str) -> Successes | None:
+        both = sorted({*self.seeds(task, policy)} & {*self.seeds(task, other)})
+        found = _aligned([self._final[Cell(task, name, seed)] for name in (policy, other) for seed in both])
+        return None if found is None else found[: len(both)] - found[len(both) :]
 
     # The paper's rule: the mean of the best five evaluations during training, of each seed. ---------------------
 
@@ -202,3 +193,9 @@ class Results:
 def _hardware(kind: dict[str, Any], dtype: str | None) -> str:
     precision = f", trained in {dtype}" if dtype else ""
     return f"{kind['gpu'] or kind['cpu']} ({kind['cores']} cores, {kind['threads']} thread a cell{precision})"
+
+
+def _aligned(outcomes: Sequence[dict[int, bool]]) -> Successes | None:
+    """Outcomes by episode as rows, in the episodes that all of them have; None if there are none."""
+    common = sorted(set.intersection(*map(set, outcomes))) if outcomes else []
+    return np.array([[int(each[episode]) for episode in common] for each in outcomes]) if common else None

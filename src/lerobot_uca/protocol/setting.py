@@ -1,5 +1,6 @@
 """Settings for training and evaluating cells: a YAML file, or the name of one in this package's folder `settings`."""
 
+import json
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from importlib.resources import files
@@ -74,7 +75,7 @@ class Setting:
     """All that decides a cell's result besides task, policy and seed."""
 
     name: str
-    """The file's name without its ending."""
+    """The file's name without its ending, unless the file holds another."""
     description: str
     """One line, printed with every table."""
     batch_size: int
@@ -115,8 +116,9 @@ class Setting:
         if name not in known and not path.is_file():
             raise UserError(f"Unknown setting '{name}'. Settings: {', '.join(sorted(known))}, or a file's path.")
         try:
-            values = yaml.safe_load(known.get(name, path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            text = known.get(name, path).read_text(encoding="utf-8")
+            values = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)  # to YAML 5e-05 is a word
+        except (OSError, ValueError, yaml.YAMLError) as error:
             raise UserError(f"Setting '{name}' cannot be read: {' '.join(str(error).split())}") from error
         return cls.from_values(path.stem, values)
 
@@ -137,6 +139,8 @@ class Setting:
 
     def check(self) -> None:
         """Raise a `UserError` for values that cannot be."""
+        if not isinstance(self.name, str):
+            raise UserError(f"Setting '{self.name}': name must be text.")
         self._check_mappings()
         counts = ("batch_size", "demonstrations", "interim_episodes", "final_episodes")
         for name, value in [(name, getattr(self, name)) for name in counts]:
