@@ -257,22 +257,18 @@ def test_bfloat16_is_for_processors_that_have_it(monkeypatch, caplog, dataset_ro
     assert caplog.messages == ["This processor has no instructions for policy.dtype=bfloat16: training is in float32."]
 
 
-def test_an_option_that_cannot_be_is_not_the_checkpoints_fault(tmp_path):
+def test_a_policy_that_cannot_be_loaded_is_named_with_its_options(tmp_path):
     UCAFlowPolicy(make_config()).save_pretrained(tmp_path)
 
     def load(*options: str) -> PreTrainedConfig:
         return PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=list(options))
 
     assert load("--use_amp=true", "--n_action_steps=2").n_action_steps == 2
-    with pytest.raises(UserError, match=r"^One of .* policy\.use_amp=maybe, policy\.dim=8: .*`use_amp`.*'maybe'"):
+    with pytest.raises(UserError, match=r"loaded with policy\.use_amp=maybe, policy\.dim=8: .*`use_amp`.*'maybe'"):
         load("--use_amp=maybe", "--dim=8")
-    whole = (tmp_path / "config.json").read_text()
-    (tmp_path / "config.json").write_text(whole.replace('"use_amp": false', '"use_amp": "maybe"'))
-    with pytest.raises(UserError, match="does not hold a policy that can be loaded: DecodingError: `use_amp`"):
-        load("--dim=8")
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(UserError, match="does not hold a policy that can be loaded: JSONDecodeError"):
-        load("--use_amp=maybe")
+        load()
 
 
 def test_an_evaluation_imitates_no_bfloat16(monkeypatch, caplog, tmp_path):

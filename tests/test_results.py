@@ -13,6 +13,13 @@ CSV_FILES = sorted((BENCHMARKS / "results").glob("*.csv"))
 TEXT_FILES = sorted((BENCHMARKS / "results").glob("*.txt"))
 
 
+def test_no_result_is_larger_than_a_mebibyte():
+    """Every clone has them all."""
+    sizes = {path: path.stat().st_size for path in (BENCHMARKS / "results").rglob("*") if path.is_file()}
+    assert sizes
+    assert [path for path, size in sizes.items() if size > 2**20] == []
+
+
 @pytest.fixture
 def common(monkeypatch):
     """The benchmarks' module, as their scripts import it."""

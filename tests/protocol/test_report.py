@@ -247,10 +247,19 @@ def test_differences_are_paired(folder, tmp_path):
 def test_a_reports_folder_can_be_reported(folder, tmp_path):
     main(["report", str(folder.path), f"--output={tmp_path}/first"])
     main(["report", str(tmp_path / "first"), f"--output={tmp_path}/second", "--html"])
-    for name in ("episodes.csv", "cells.json", "report.md", "table_3.tex", "success_over_epochs.svg"):
+    for name in (
+        "episodes_uca_flow_0.csv",
+        "episodes_adaln_0.csv",
+        "cells.json",
+        "report.md",
+        "table_3.tex",
+        "success_over_epochs.svg",
+    ):
         assert (tmp_path / "first" / name).read_text() == (tmp_path / "second" / name).read_text()
     together, _ = Results.read([folder.path, tmp_path / "first"])
     assert together.rows == Results.read([folder.path])[0].rows
+    main(["report", str(folder.path), f"--output={tmp_path}/first", "--policies=adaln"])
+    assert [path.name for path in (tmp_path / "first").glob("*episodes*.csv")] == ["episodes_adaln_0.csv"]
 
 
 class Page(HTMLParser):

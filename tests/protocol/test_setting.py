@@ -93,6 +93,7 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
             {**GOOD, "benchmarks": {"libero": {}}},
             "benchmarks holds options by benchmark (adroit, metaworld), got 'libero'",
         ),
+        ({**GOOD, "name": None}, "name must be text, got None"),
         (
             {**GOOD, "policies": {"uca": {}}},
             "policies holds options by type (dp3, flowpolicy, mp1, simple_dp3, uca_flow",

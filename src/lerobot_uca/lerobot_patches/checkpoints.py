@@ -7,7 +7,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from draccus.utils import DecodingError
 from lerobot.common import train_utils
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import factory as policy_factory
@@ -58,21 +57,15 @@ def make_registered_steps_only() -> None:
 
 
 def report_damaged_checkpoints() -> None:
-    """One line names the missing or damaged part, or the option that cannot be. LeRobot shows a library's traceback."""
+    """One line names the missing or damaged part, or the wrong option. LeRobot shows a library's traceback."""
 
     def policy(load: Callable[..., Any]) -> Callable[..., Any]:
         def from_pretrained(
             cls: type, pretrained_name_or_path: Path | str, cli_overrides: Sequence[str] | None = (), **kwargs: Any
         ) -> Any:
-            with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded"):
-                try:
-                    return load(cls, pretrained_name_or_path, cli_overrides=cli_overrides, **kwargs)
-                except DecodingError:
-                    if not cli_overrides:
-                        raise
-                    load(cls, pretrained_name_or_path, **kwargs)  # to see whether the checkpoint is at fault
-            options = ", ".join(f"policy.{option.lstrip('-')}" for option in cli_overrides)
-            with reported(f"One of the options cannot be set to its value, {options}"):
+            options = ", ".join(f"policy.{option.lstrip('-')}" for option in cli_overrides or ())
+            changed = f" with {options}" if options else ""
+            with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded{changed}"):
                 return load(cls, pretrained_name_or_path, cli_overrides=cli_overrides, **kwargs)
 
         return from_pretrained

@@ -118,7 +118,7 @@ class RunFolder:
 
     def read(self) -> Iterator[Row | CorruptRow]:
         """All rows of all cells, and the lines that are not rows."""
-        for path in [*self.path.glob("episodes.csv"), *sorted(self.path.glob("cells/*/*/*/*/rows/*.csv"))]:
+        for path in [*sorted(self.path.glob("episodes*.csv")), *sorted(self.path.glob("cells/*/*/*/*/rows/*.csv"))]:
             yield from read_rows(path)
 
     def records(self) -> Iterator[dict[str, Any]]:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import ndtri, stdtrit
 
-Z_95 = 1.959963984540054  # of the standard normal distribution
+Z_95 = float(ndtri(0.975))
 
 Successes = NDArray[np.int64]
 """Of a task (S, N), S training seeds in the same N episodes: 1 a success, 0 a failure; or two policies' differences."""
@@ -34,7 +34,7 @@ def wilson(rate: float, n_episodes: int) -> Estimate:
     """A success rate with Wilson's interval, which stays inside [0, 1] also at 0 and 1.
 
     It is that of independent episodes. Trainings that are evaluated in the same episodes add none: their mean rate has
-    at most this interval, as far as episodes go.
+    at most this interval, as far as episodes go. (SciPy's takes whole numbers of successes, which a mean's are not.)
     """
     squared = Z_95**2
     centre = (rate + squared / (2 * n_episodes)) / (1 + squared / n_episodes)

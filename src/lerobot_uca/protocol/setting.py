@@ -129,6 +129,8 @@ class Setting:
         if not isinstance(values, dict) or not set(values) <= set(valid):
             got = ", ".join(map(str, values)) if isinstance(values, dict) else type(values).__name__
             raise UserError(f"Setting '{name}' may hold {', '.join(valid)}, got {got}.")
+        if not isinstance(values.get("name", name), str):
+            raise UserError(f"Setting '{name}': name must be text, got {values['name']!r}.")
         try:
             lengths = {key: Length(**length) for key, length in values["lengths"].items()}
             setting = cls(**{"name": name, **values, "lengths": lengths})
@@ -139,8 +141,6 @@ class Setting:
 
     def check(self) -> None:
         """Raise a `UserError` for values that cannot be."""
-        if not isinstance(self.name, str):
-            raise UserError(f"Setting '{self.name}': name must be text.")
         self._check_mappings()
         counts = ("batch_size", "demonstrations", "interim_episodes", "final_episodes")
         for name, value in [(name, getattr(self, name)) for name in counts]:
