@@ -15,6 +15,9 @@ import matplotlib as mpl
 import pytest
 
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
+from lerobot_uca.protocol import command as benchmark
+from lerobot_uca.protocol import demonstrators
+from lerobot_uca.protocol.setting import Setting
 from tests.depth_builders import make_calibration, write_depth_dataset
 from tests.robots.test_calibrate import render_boards, write_points
 
@@ -87,6 +90,33 @@ def plain(command: str) -> str:
 
 def reason_not_to_run(command: str) -> str | None:
     return next((reason for beginning, reason in NOT_RUN.items() if plain(command).startswith(beginning)), None)
+
+
+def benchmark_commands() -> list[str]:
+    """Those that are not run, each once."""
+    every = [command for page in PAGES for command in commands_of(page)]
+    return sorted({command for command in every if command.startswith("lerobot-uca-benchmark")})
+
+
+def test_there_are_commands_of_each_kind():
+    assert {command.split()[1] for command in benchmark_commands()} == {"run", "report", "demonstrators"}
+
+
+@pytest.mark.parametrize("command", benchmark_commands())
+def test_a_benchmarks_command_has_options_and_names_that_there_are(command, monkeypatch, capsys):
+    """It is followed up to where its work would begin."""
+    works = []
+
+    def instead(result):
+        return lambda *arguments, **_: works.append(arguments) or result
+
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(benchmark, "make_folder", lambda _, setting: Setting.load(setting))
+    monkeypatch.setattr(benchmark, "run", instead(result=True))
+    monkeypatch.setattr(benchmark, "report", instead(result=""))
+    monkeypatch.setattr(demonstrators, "demonstrators", instead(result=[]))
+    benchmark.main(shlex.split(command)[1:])
+    assert len(works) == 1
 
 
 def tiny(command: str) -> tuple[str, list[str]]:

@@ -3,10 +3,12 @@ import csv
 import numpy as np
 import pytest
 
+from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.envs.experts.expert import Attempt, Pushes, Smoothed, pushed, smoothed
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.command import main
+from lerobot_uca.protocol.demonstrators import try_once
 
 
 def steps_of(values):
@@ -77,8 +79,18 @@ def test_pushes_need_a_hand_that_actions_move():
         pushed(iter([]), 0.1, ["WRJ1", "WRJ0", "LFJ0"])
 
 
-def test_a_table_of_experts(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(MetaworldPointCloudEnv, "observe", None)  # nobody looks
+def test_an_episode_is_looked_at_once(monkeypatch):
+    """Clouds take most of a step, and no expert looks at them."""
+    looks = []
+    monkeypatch.setattr(MetaworldPointCloudEnv, "observe", lambda _: looks.append(1))
+    config = MetaworldPointCloudConfig(task="drawer-close")
+    attempt = next(config.attempts("drawer-close", None, 0))
+    trial = try_once(config.env_factory("drawer-close"), attempt)
+    assert trial.n_successful > 10
+    assert len(looks) == 1
+
+
+def test_a_table_of_experts(tmp_path, capsys):
     path = tmp_path / "table.csv"
     main(["demonstrators", "--tasks=drawer-close", "--episodes=2", f"--output={path}"])
     with path.open(newline="") as file:
@@ -89,8 +101,7 @@ def test_a_table_of_experts(tmp_path, capsys, monkeypatch):
     assert "metaworld/drawer-close: 2 of 2 (any success: 2)" in capsys.readouterr().out
 
 
-def test_a_table_of_experts_that_are_pushed_all_the_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(MetaworldPointCloudEnv, "observe", None)
+def test_a_table_of_experts_that_are_pushed_all_the_time(tmp_path):
     path = tmp_path / "table.csv"
     options = ["--episodes=1", "--straight_paths=true", "--pushes=0.99"]
     main(["demonstrators", "--tasks=pick-place", *options, f"--output={path}"])

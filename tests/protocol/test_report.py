@@ -20,7 +20,8 @@ from lerobot_uca.protocol.folder import RunFolder, write_json
 from lerobot_uca.protocol.paper import ABLATION, COLUMNS, MILLISECONDS, SUCCESS, goal
 from lerobot_uca.protocol.results import Results
 from lerobot_uca.protocol.rows import Row, write_rows
-from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.protocol.setting import FIRST_TUNING_SEED, Setting
+from lerobot_uca.whole_file import whole_file
 
 SETTING = Setting.from_values(
     "tiny",
@@ -50,7 +51,7 @@ def add_cell(folder, cell, n_final, interim=(0, 20, 20, 20, 20, 10)):
         "inference": {"median_ms": 2.0 + cell.seed},
         "minutes": {"training": 6.0, "evaluation": 1.0},
         "hardware": {"cpu": "a CPU", "gpu": None, "cores": 2, "threads": 1},
-        "dtype": ("bfloat16", "float32")[cell.seed],
+        "dtype": ("bfloat16", "float32")[cell.seed % 2],
     }
     write_json(files.result, record)
 
@@ -164,8 +165,8 @@ def test_wilson_for_a_task_and_milliseconds_for_a_policy(folder):
     assert corrupt == []
     expected = 0.85, 0.7672, 0.9069  # of 100 episodes, the same for both seeds
     assert results.honest([REACH], "uca_flow") == pytest.approx(expected, abs=1e-3)
-    assert results.milliseconds(results.tasks, "uca_flow") == (2.5, 0.5)
-    assert results.papers_rule([REACH], "uca_flow") == (pytest.approx(0.9), 0)
+    assert results.milliseconds(results.tasks, "uca_flow") == (2.5, 0.5, 2)
+    assert results.papers_rule([REACH], "uca_flow") == (pytest.approx(0.9), 0, 1)
 
 
 def test_with_less_than_five_evaluations_the_papers_rule_has_no_number(tmp_path):
@@ -173,6 +174,79 @@ def test_with_less_than_five_evaluations_the_papers_rule_has_no_number(tmp_path)
     add_cell(folder, Cell(REACH, "uca_flow", 0), 50, interim=(20, 20, 20, 20))
     results, _ = Results.read([folder.path])
     assert results.papers_rule([REACH], "uca_flow") is None
+
+
+def test_the_papers_rule_counts_tasks_alike_and_compares_seeds_on_the_same_tasks(tmp_path):
+    """Reach, 100 %, has one seed; its wall two, 50 and 80 %. A deviation over all would be of tasks, not of seeds."""
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    add_cell(folder, Cell(REACH, "uca_flow", 0), 100, interim=[20] * 5)
+    add_cell(folder, Cell(WALL, "uca_flow", 0), 50, interim=[10] * 5)
+    add_cell(folder, Cell(WALL, "uca_flow", 1), 80, interim=[16] * 5)
+    results, _ = Results.read([folder.path])
+    assert results.papers_rule([WALL], "uca_flow") == pytest.approx((0.65, 0.15, 1))
+    assert results.papers_rule([REACH, WALL], "uca_flow") == (pytest.approx((1 + 0.65) / 2), None, 2)
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    table = read_csv(tmp_path / "report" / "table_1.csv")
+    assert table[2][5] == "82.5 (2 of 21 tasks)"
+    times = read_csv(tmp_path / "report" / "table_2.csv")[2]
+    assert times[6] == "2.3 +- 0.5 (2 of 21 tasks)"
+    assert times[-1] == "2.3 +- 0.5 (2 of 37 tasks)"
+    latex = (tmp_path / "report" / "table_1.tex").read_text()
+    assert r"82.5\textsuperscript{2 of 21 tasks}" in latex
+
+
+def test_an_average_says_of_how_many_tasks_it_is_also_while_cells_are_evaluated(tmp_path):
+    """The fresh episodes of a cell come after its other evaluations."""
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    add_cell(folder, Cell(REACH, "uca_flow", 0), 50)
+    (folder.cell(Cell(REACH, "uca_flow", 0)).rows / "final.csv").unlink()
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    table = read_csv(tmp_path / "report" / "table_1.csv")
+    assert [row[5] for row in table[2:4]] == ["90.0 (1 of 21 tasks)", "missing"]
+
+
+def test_two_results_of_a_cell_are_not_mixed(folder, tmp_path):
+    """Whichever success was kept, the table would show a training that nobody has made."""
+    other = RunFolder.create(tmp_path / "other", SETTING)
+    add_cell(other, Cell(REACH, "uca_flow", 0), 79)
+    with pytest.raises(UserError, match=r"hold different results of metaworld/reach uca_flow seed 0, .* seed 4000079"):
+        Results.read([folder.path, other.path])
+
+
+def test_what_a_killed_process_has_not_finished_is_no_result(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    cell = Cell(REACH, "uca_flow", 0)
+    rows = folder.cell(cell).rows
+    rows.mkdir(parents=True)
+    final = [row for row in make_rows(cell, 100, ()) if row.is_final]
+    with whole_file(rows / "final.csv") as unfinished:
+        write_rows(unfinished, final[:30])
+    (rows / "final.csv").rename(unfinished)  # as a SIGKILL leaves it
+    assert list(folder.read()) == []
+
+
+def test_a_report_does_not_replace_what_it_reports(folder, tmp_path):
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    before = {path: path.read_bytes() for path in (tmp_path / "report").iterdir()}
+    with pytest.raises(UserError, match="is what is to be reported: its rows would be replaced"):
+        main(["report", f"{tmp_path}/report", f"--output={tmp_path}/run/../report", "--policies=uca_flow"])
+    assert {path: path.read_bytes() for path in (tmp_path / "report").iterdir()} == before
+
+
+def test_tuning_has_other_episodes_and_is_left_out_beside_the_table(tmp_path, capsys):
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    add_cell(folder, Cell(REACH, "uca_flow", 0), 80)
+    tuning = RunFolder.create(tmp_path / "tuning", SETTING)
+    cell = Cell(REACH, "uca_flow", FIRST_TUNING_SEED)
+    add_cell(tuning, cell, 60)
+    main(["report", str(folder.path), str(tuning.path), f"--output={tmp_path}/report"])
+    assert "warning: training seeds for tuning (100) are left out" in capsys.readouterr().err
+    _, row = read_csv(tmp_path / "report" / "tasks.csv")
+    assert row[2] == "0"
+    assert row[-1].startswith("80.0 [")
+    main(["report", str(tuning.path), f"--output={tmp_path}/tuned"])
+    assert "warning" not in capsys.readouterr().err
+    assert read_csv(tmp_path / "tuned" / "tasks.csv")[1][2] == "100"
 
 
 @pytest.mark.parametrize(

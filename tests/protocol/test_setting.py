@@ -67,7 +67,20 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
         ({**GOOD, "batchsize": 8}, "may hold name, description, batch_size"),
         ({"batch_size": 8}, "is not complete"),
         ({**GOOD, "batch_size": 0}, "batch_size must be a whole number above 0, got 0"),
-        ({**GOOD, "lengths": {"metaworld": {"steps": 5, "evaluations": 2}}}, "must be a multiple of its evaluations"),
+        ({**GOOD, "batch_size": True}, "batch_size must be a whole number above 0, got True"),
+        (
+            {**GOOD, "lengths": {"metaworld": {"steps": 5, "evaluations": 2}}},
+            "a multiple of its evaluations, got 5 and 2",
+        ),
+        (
+            {**GOOD, "lengths": {"metaworld": {"steps": "2e3", "evaluations": 2}}},
+            "a whole number above 0 and a multiple",
+        ),
+        ({**GOOD, "lengths": {"metaworld": {"steps": 4.0, "evaluations": 2}}}, "evaluations, got 4.0 and 2"),
+        (
+            {**GOOD, "lengths": {"metaworld/raech": {"steps": 4, "evaluations": 2}}},
+            "by benchmark (adroit, metaworld) or 'benchmark/task', got 'metaworld/raech'",
+        ),
         ({**GOOD, "pushes": 0.1}, "pushes must hold values by name, got 0.1"),
         ({**GOOD, "smoothing": None}, "smoothing must hold values by name, got None"),
         ({**GOOD, "benchmarks": 3}, "benchmarks must hold values by name, got 3"),

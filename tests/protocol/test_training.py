@@ -11,7 +11,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import run_cell as run_cell_module
 from lerobot_uca.protocol import training
 from lerobot_uca.protocol.cells import Cell
-from lerobot_uca.protocol.folder import RunFolder
+from lerobot_uca.protocol.folder import RunFolder, write_json
 from lerobot_uca.protocol.launchers import Ended
 from lerobot_uca.protocol.run import run as run_cells
 from lerobot_uca.protocol.run_cell import Outcome, run_cell
@@ -118,6 +118,55 @@ def test_a_cells_process_that_is_killed_is_recorded_and_the_rest_goes_on(folder,
     output = capsys.readouterr().out
     assert f"[1/2, 0:00 h left] {CELL} FAILED: its process was killed" in output
     assert "finished: 0, failed: 1, being worked on by another process: 1" in output
+
+
+def test_a_cells_process_that_could_not_begin_is_recorded_and_the_rest_goes_on(folder, tmp_path, capfd):
+    """As on a node that does not share the disk. What an earlier try has recorded is not its reason."""
+    write_json(folder.cell(CELL).failure, {"reason": "an old one"})
+    command = [sys.executable, "-m", "lerobot_uca.protocol.run_cell", str(tmp_path / "nowhere"), *map(str, CELL)]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert ended.stderr.startswith("error: ")
+    assert "is not the folder of a benchmark run" in ended.stderr
+
+    def launch(path, cells, expert):
+        yield Ended(CELL, ended.returncode)
+        folder.cell(OTHER).path.touch()  # no folder: nothing can be recorded
+        yield Ended(OTHER, ended.returncode)
+
+    assert not run_cells(folder, [CELL, OTHER], launch, None)
+    output = capfd.readouterr().out
+    for cell in (CELL, OTHER):
+        assert f"{cell} FAILED: its process ended with exit code 1" in output
+    assert "an old one" not in output
+    assert "finished: 0, failed: 2" in output
+
+
+def test_a_run_begins_and_goes_on_with_space_alone(folder, monkeypatch, capsys):
+    """After the last cell nothing more needs any."""
+    monkeypatch.setattr("lerobot_uca.protocol.run.free_bytes", lambda _: free.pop(0))
+    launched = []
+
+    def launch(path, cells, expert):
+        for cell in cells:
+            launched.append(cell)
+            yield Ended(cell, Outcome.CLAIMED)
+
+    free = [1000]
+    with pytest.raises(UserError, match=r"Less than 1 GiB of space left for .* it goes on"):
+        run_cells(folder, [CELL, OTHER], launch, None)
+    assert launched == []
+    free = [1 << 40, 1000]
+    with pytest.raises(UserError, match="Less than 1 GiB of space left"):
+        run_cells(folder, [CELL, OTHER], launch, None)
+    assert launched == [CELL]
+    free = [1 << 40, 1 << 40]
+    run_cells(folder, [CELL, OTHER], launch, None)
+    assert "being worked on by another process: 2" in capsys.readouterr().out
+
+
+def test_options_as_they_are_typed():
+    typed = as_arguments({"a": True, "b": None, "c": 0.5, "d": "text"})
+    assert typed == ["--a=true", "--b=null", "--c=0.5", "--d=text"]
 
 
 def test_the_minutes_of_a_killed_process_count(folder):

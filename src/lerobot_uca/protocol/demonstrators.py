@@ -1,6 +1,6 @@
 """`lerobot-uca-benchmark demonstrators`: how well the experts themselves do their tasks.
 
-Without clouds, which no expert looks at: an episode takes as long as its simulation.
+Without clouds, which no expert looks at, but for an episode's first: it takes as long as its simulation.
 """
 
 import csv

@@ -117,7 +117,7 @@ def success_and_latency(results: Results, plt: Any) -> Any:
             n_drawn += 1
             mean, low, high = (100 * value for value in success)
             bars = [[max(0, mean - low)], [max(0, high - mean)]]
-            axis.errorbar(time[0], mean, yerr=bars, fmt="o", color=COLOURS[policy], label=POLICIES[policy].title)
+            axis.errorbar(time.mean, mean, yerr=bars, fmt="o", color=COLOURS[policy], label=POLICIES[policy].title)
     if not n_drawn:
         plt.close(figure)
         return None

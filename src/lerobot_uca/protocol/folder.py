@@ -118,7 +118,8 @@ class RunFolder:
 
     def read(self) -> Iterator[Row | CorruptRow]:
         """All rows of all cells, and the lines that are not rows."""
-        for path in [*sorted(self.path.glob("episodes*.csv")), *sorted(self.path.glob("cells/*/*/*/*/rows/*.csv"))]:
+        rows = self.path.glob("cells/*/*/*/*/rows/[!.]*.csv")  # without what a killed process has not finished
+        for path in [*sorted(self.path.glob("episodes*.csv")), *sorted(rows)]:
             yield from read_rows(path)
 
     def records(self) -> Iterator[dict[str, Any]]:

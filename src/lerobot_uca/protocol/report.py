@@ -39,12 +39,21 @@ def report(
         rollouts_of: tasks of which an episode of each policy is shown; for that it is run again.
 
     Raises:
-        UserError: if there are no results, or no checkpoint for rollouts, or the folder cannot be written.
+        UserError: if there are no results, or no checkpoint for rollouts, or the folder cannot be written or is
+            itself reported.
     """
+    if output.resolve() in [run.resolve() for run in runs]:
+        raise UserError(f"--output '{output}' is what is to be reported: its rows would be replaced. Choose another.")
     results, corrupt = Results.read(runs)
     for line in corrupt:
         print(f"warning: {line}", file=sys.stderr)
-    results = results.of_policies(policies)
+    results, tuning = results.of(lambda cell: cell.policy in policies).without_tuning()
+    if tuning:
+        print(
+            f"warning: training seeds for tuning ({', '.join(map(str, tuning))}) are left out: "
+            "their episodes are others than the other seeds'.",
+            file=sys.stderr,
+        )
     if not results.rows:
         raise UserError(f"There are no results yet in {', '.join(map(str, runs))} for {', '.join(policies)}.")
     strips = rollouts.strips_of(runs, results, rollouts_of) if rollouts_of else []

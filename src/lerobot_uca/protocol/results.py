@@ -2,9 +2,9 @@
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -13,9 +13,19 @@ from lerobot_uca.protocol.cells import POLICIES, Cell
 from lerobot_uca.protocol.folder import RunFolder, first_difference, write_json
 from lerobot_uca.protocol.intervals import Estimate, Successes, mean_over_tasks, wilson
 from lerobot_uca.protocol.rows import CorruptRow, Row, write_rows
-from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.protocol.setting import FIRST_TUNING_SEED, Setting
 
 N_BEST = 5
+
+
+class Spread(NamedTuple):
+    """A mean and the standard deviation of what it is of."""
+
+    mean: float
+    deviation: float | None
+    """None where there is nothing to compare."""
+    n_tasks: int
+    """Of the tasks asked for, those that there are."""
 
 
 class Results:
@@ -28,7 +38,7 @@ class Results:
     """
 
     def __init__(self, setting: Setting, rows: Iterable[Row], records: Iterable[dict[str, Any]]) -> None:
-        self.setting, self.rows = setting, sorted(set(rows), key=lambda row: (*row.cell, row.is_final, *row[3:]))
+        self.setting, self.rows = setting, sorted(rows, key=lambda row: (*row.cell, row.is_final, *row[3:]))
         self.records = {Cell(**record["cell"]): record for record in records}
         self._final: dict[Cell, dict[int, bool]] = defaultdict(dict)
         self._interim: dict[Cell, dict[int, list[bool]]] = defaultdict(lambda: defaultdict(list))
@@ -49,7 +59,8 @@ class Results:
         """The results in folders, and the lines in them that are not rows.
 
         Raises:
-            UserError: if a path is not a run's folder, or they were made with different settings.
+            UserError: if a path is not a run's folder, they were made with different settings, or hold different
+                results of the same cell.
         """
         folders = [RunFolder.open(path) for path in paths]
         first = folders[0]
@@ -60,15 +71,25 @@ class Results:
                     f"'{first.path}' and '{other.path}' were made with different settings: {difference}. "
                     "A table holds results of one setting."
                 )
-        found = [row for folder in folders for row in folder.read()]
-        rows = [row for row in found if isinstance(row, Row)]
+        found = [(folder.path, row) for folder in folders for row in folder.read()]
+        rows = _without_repetition([(path, row) for path, row in found if isinstance(row, Row)])
         records = [record for folder in folders for record in folder.records()]
-        return cls(first.setting, rows, records), [row for row in found if isinstance(row, CorruptRow)]
+        return cls(first.setting, rows, records), [row for _, row in found if isinstance(row, CorruptRow)]
 
-    def of_policies(self, policies: Sequence[str]) -> Self:
-        """The results of these policies alone."""
-        rows = (row for row in self.rows if row.cell.policy in policies)
-        return type(self)(self.setting, rows, (self.records[cell] for cell in self.records if cell.policy in policies))
+    def of(self, is_wanted: Callable[[Cell], bool]) -> Self:
+        """The results of some cells alone."""
+        rows = (row for row in self.rows if is_wanted(row.cell))
+        return type(self)(self.setting, rows, (self.records[cell] for cell in self.records if is_wanted(cell)))
+
+    def without_tuning(self) -> tuple[Self, list[int]]:
+        """The results without training seeds for tuning, which have other episodes, and these seeds.
+
+        Where there are no others, nothing is left out.
+        """
+        tuning = sorted({cell.seed for cell in self._cells if cell.seed >= FIRST_TUNING_SEED})
+        if not tuning or all(cell.seed in tuning for cell in self._cells):
+            return self, []
+        return self.of(lambda cell: cell.seed not in tuning), tuning
 
     def write(self, folder: Path) -> None:
         """Write all of it into a folder that `read` reads, in place of other results there."""
@@ -103,6 +124,10 @@ class Results:
         """The last checkpoints' successes in the fresh episodes that all training seeds have, if there are any."""
         return _aligned([self._final[Cell(task, policy, seed)] for seed in self.seeds(task, policy)])
 
+    def n_evaluated(self, tasks: Sequence[str], policy: str) -> int:
+        """How many of the tasks have a last checkpoint that is evaluated."""
+        return sum(bool(self.seeds(task, policy)) for task in tasks)
+
     def honest(self, tasks: Sequence[str], policy: str) -> Estimate | None:
         """Success on those of the tasks that are there: Wilson's interval for one task, else Student's."""
         there = [found for task in tasks if (found := self.successes(task, policy)) is not None]
@@ -127,18 +152,23 @@ class Results:
 
     # The paper's rule: the mean of the best five evaluations during training, of each seed. ---------------------
 
-    def papers_rule(self, tasks: Sequence[str], policy: str) -> tuple[float, float] | None:
-        """Success on those of the tasks that are there: mean and standard deviation over seeds of their means."""
-        by_seed: dict[int, list[float]] = defaultdict(list)
+    def papers_rule(self, tasks: Sequence[str], policy: str) -> Spread | None:
+        """Success on those of the tasks that are there, all alike: the mean of their seeds' means.
+
+        The deviation is over the means of the training seeds that have all of these tasks.
+        """
+        by_task: dict[str, dict[int, float]] = defaultdict(dict)
         for cell in self._cells:
             if cell.task in tasks and cell.policy == policy:
                 rates = sorted((float(np.mean(each)) for each in self._interim[cell].values()), reverse=True)
                 if len(rates) >= N_BEST:
-                    by_seed[cell.seed].append(float(np.mean(rates[:N_BEST])))
-        if not by_seed:
+                    by_task[cell.task][cell.seed] = float(np.mean(rates[:N_BEST]))
+        if not by_task:
             return None
-        every = [rate for rates in by_seed.values() for rate in rates]
-        return float(np.mean(every)), float(np.std([np.mean(rates) for rates in by_seed.values()]))
+        common = set.intersection(*map(set, by_task.values()))
+        of_seeds = [np.mean([rates[seed] for rates in by_task.values()]) for seed in sorted(common)]
+        mean = float(np.mean([np.mean([*rates.values()]) for rates in by_task.values()]))
+        return Spread(mean, _deviation(of_seeds), len(by_task))
 
     def curve(self, task: str, policy: str) -> dict[float, list[float]]:
         """Success by epoch, of each seed."""
@@ -179,14 +209,11 @@ class Results:
 
     # Inference. -------------------------------------------------------------------------------------------------
 
-    def milliseconds(self, tasks: Sequence[str], policy: str) -> tuple[float, float] | None:
-        """Mean and standard deviation over cells of the median time for a chunk."""
-        times = [
-            record["inference"]["median_ms"]
-            for cell, record in self.records.items()
-            if cell.task in tasks and cell.policy == policy
-        ]
-        return (float(np.mean(times)), float(np.std(times))) if times else None
+    def milliseconds(self, tasks: Sequence[str], policy: str) -> Spread | None:
+        """The median time for a chunk: mean and deviation over the cells."""
+        cells = [cell for cell in self.records if cell.task in tasks and cell.policy == policy]
+        times = [self.records[cell]["inference"]["median_ms"] for cell in cells]
+        return Spread(float(np.mean(times)), _deviation(times), len({cell.task for cell in cells})) if times else None
 
     def hardware(self) -> list[str]:
         """The hardware that the cells ran on, and the precision of their trainings, which depends on it."""
@@ -199,6 +226,23 @@ class Results:
 def _hardware(kind: dict[str, Any], dtype: str | None) -> str:
     precision = f", trained in {dtype}" if dtype else ""
     return f"{kind['gpu'] or kind['cpu']} ({kind['cores']} cores, {kind['threads']} thread a cell{precision})"
+
+
+def _without_repetition(found: Iterable[tuple[Path, Row]]) -> list[Row]:
+    """Each episode once: a run's and its report's folder hold the same."""
+    first: dict[tuple[Any, ...], tuple[Path, Row]] = {}
+    for path, row in found:
+        other, same = first.setdefault((*row.cell, row.step, row.is_final, row.episode_seed), (path, row))
+        if row != same:
+            raise UserError(
+                f"'{other}' and '{path}' hold different results of {row.cell}, in the episode of seed "
+                f"{row.episode_seed} for example. A table takes one training of a cell: leave one of them out."
+            )
+    return [row for _, row in first.values()]
+
+
+def _deviation(values: Sequence[Any]) -> float | None:
+    return float(np.std(values)) if len(values) > 1 else None
 
 
 def _aligned(outcomes: Sequence[dict[int, bool]]) -> Successes | None:

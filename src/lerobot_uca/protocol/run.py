@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from lerobot_uca.errors import UserError
@@ -13,14 +14,14 @@ from lerobot_uca.protocol.run_cell import Outcome
 from lerobot_uca.protocol.training import ended
 
 MIN_FREE_BYTES = 1 << 30
-"""A cell is not begun with less space: demonstrations, checkpoints and logs of a small one take a tenth."""
+"""A run does not begin or go on with less space: demonstrations, checkpoints and logs of a small cell take a tenth."""
 
 
 def run(folder: RunFolder, cells: Sequence[Cell], launch: Launcher, expert: str | None) -> bool:
     """Run the cells that are not finished; whether all of them are now.
 
     Raises:
-        UserError: before anything starts, if a cell cannot run; afterwards, if the disk is full.
+        UserError: before anything starts, if a cell cannot run; then and afterwards, if the disk is full.
     """
     for cell in cells:
         folder.setting.length(cell)
@@ -33,6 +34,7 @@ def run(folder: RunFolder, cells: Sequence[Cell], launch: Launcher, expert: str 
     folder.log(f"{len(missing)} of {len(cells)} cells to do, setting '{folder.setting.name}'")
     if not missing:
         return True
+    _check_space(folder)
     begin = time.monotonic()
     failed, claimed = [], []
     for n_done, each in enumerate(launch(folder.path, missing, expert), start=1):
@@ -46,16 +48,21 @@ def run(folder: RunFolder, cells: Sequence[Cell], launch: Launcher, expert: str 
             failed.append(each.cell)
         minutes_left = (time.monotonic() - begin) / 60 / n_done * (len(missing) - n_done)
         folder.log(f"[{n_done}/{len(missing)}, {_duration(minutes_left)} left] {_describe(folder, each)}")
-        if free_bytes(folder.path) < MIN_FREE_BYTES:
-            raise UserError(
-                f"Less than {MIN_FREE_BYTES >> 30} GiB of space left for '{folder.path}'. "
-                "Free some and start the same command again: it goes on."
-            )
+        if n_done < len(missing):
+            _check_space(folder)
     folder.log(
         f"finished: {len(missing) - len(failed) - len(claimed)}, failed: {len(failed)}, "
         f"being worked on by another process: {len(claimed)}"
     )
     return not failed and not claimed
+
+
+def _check_space(folder: RunFolder) -> None:
+    if free_bytes(folder.path) < MIN_FREE_BYTES:
+        raise UserError(
+            f"Less than {MIN_FREE_BYTES >> 30} GiB of space left for '{folder.path}'. "
+            "Free some and start the same command again: it goes on."
+        )
 
 
 def _describe(folder: RunFolder, each: Ended) -> str:
@@ -67,14 +74,11 @@ def _describe(folder: RunFolder, each: Ended) -> str:
             return f"{each.cell}: {100 * result['success']:.0f} % of {result['episodes']} fresh episodes ({minutes})"
         case Outcome.CLAIMED:
             return f"{each.cell}: another process works on it"
-        case Outcome.FAILED if each.reason is not None:
-            reason = each.reason
-            write_json(files.failure, {"reason": reason})
-        case Outcome.FAILED:
-            reason = json.loads(files.failure.read_text(encoding="utf-8"))["reason"]
-        case _:  # it could not say so itself
-            reason = f"its process {ended(each.returncode)}"
-            write_json(files.failure, {"reason": reason})
+        case Outcome.FAILED if each.reason is None:
+            return f"{each.cell} FAILED: {json.loads(files.failure.read_text(encoding='utf-8'))['reason']}"
+    reason = each.reason or f"its process {ended(each.returncode)}"  # it could not say so itself
+    with suppress(OSError):  # which may be why: the other cells go on
+        write_json(files.failure, {"reason": reason})
     return f"{each.cell} FAILED: {reason}"
 
 

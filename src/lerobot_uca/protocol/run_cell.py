@@ -41,9 +41,10 @@ class Outcome(IntEnum):
     """The exit codes of a cell's process."""
 
     FINISHED = 0
-    FAILED = 1
     CLAIMED = 3
     """Another process works on it."""
+    FAILED = 4
+    """It has recorded the reason. Python itself ends with 1 or 2."""
     NO_SPACE = 28
 
 
@@ -212,7 +213,11 @@ def main() -> None:
     """Run the cell that the command line names."""
     tie_to_parent()
     path, task, policy, seed, *expert = sys.argv[1:]
-    sys.exit(run_cell(RunFolder.open(Path(path)), Cell(task, policy, int(seed)), expert[0] if expert else None))
+    try:
+        folder = RunFolder.open(Path(path))
+    except UserError as error:  # on a node that does not share the disk
+        sys.exit(f"error: {error}")
+    sys.exit(run_cell(folder, Cell(task, policy, int(seed)), expert[0] if expert else None))
 
 
 if __name__ == "__main__":

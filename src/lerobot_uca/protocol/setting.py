@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, astuple, dataclass, field, fields
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -144,14 +144,9 @@ class Setting:
         self._check_mappings()
         counts = ("batch_size", "demonstrations", "interim_episodes", "final_episodes")
         for name, value in [(name, getattr(self, name)) for name in counts]:
-            if not isinstance(value, int) or value < 1:
+            if type(value) is not int or value < 1:
                 raise UserError(f"Setting '{self.name}': {name} must be a whole number above 0, got {value!r}.")
-        for key, length in self.lengths.items():
-            if length.evaluations < 1 or length.steps < 1 or length.steps % length.evaluations:
-                raise UserError(
-                    f"Setting '{self.name}': steps of {key} must be a multiple of its evaluations, "
-                    f"got {length.steps} and {length.evaluations}."
-                )
+        self._check_lengths()
         self._check_demonstrators()
         types = sorted({method.type for method in POLICIES.values()})
         for field_name, what, valid in (("benchmarks", "benchmark", list(ENVIRONMENTS)), ("policies", "type", types)):
@@ -161,6 +156,20 @@ class Setting:
                         f"Setting '{self.name}': {field_name} holds options by {what} ({', '.join(valid)}), "
                         f"got '{name}'."
                     )
+
+    def _check_lengths(self) -> None:
+        for key, (steps, evaluations) in ((key, astuple(length)) for key, length in self.lengths.items()):
+            if key not in ENVIRONMENTS and key not in SUITES["all"]:
+                raise UserError(
+                    f"Setting '{self.name}': lengths holds steps and evaluations by benchmark "
+                    f"({', '.join(ENVIRONMENTS)}) or 'benchmark/task', got '{key}'."
+                )
+            are_whole = type(steps) is type(evaluations) is int
+            if not are_whole or evaluations < 1 or steps < 1 or steps % evaluations:
+                raise UserError(
+                    f"Setting '{self.name}': steps of {key} must be a whole number above 0 and a multiple of its "
+                    f"evaluations, got {steps!r} and {evaluations!r}."
+                )
 
     def _check_mappings(self) -> None:
         values = {each.name: getattr(self, each.name) for each in fields(self) if each.default_factory is dict}

@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from lerobot_uca.protocol import paper
 from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES
 from lerobot_uca.protocol.intervals import Estimate
-from lerobot_uca.protocol.results import Results
+from lerobot_uca.protocol.results import Results, Spread
 
 MISSING = "missing"
 RULES = (
     "Each policy has three lines: the paper's number; ours by the paper's rule, the mean of the best five evaluations "
     "during training, of each seed, which selects on the episodes it reports; ours by the honest rule, the last "
     "checkpoint in fresh episodes, with a 95 % interval (Wilson's for one task; for means Student's, from how seeds "
-    "and episodes differ within each task). +- is the standard deviation over seeds."
+    "and episodes differ within each task). Tasks count alike, however many seeds they have; +- is the standard "
+    "deviation over the seeds that have all of the tasks, where there are several."
 )
 
 
@@ -130,12 +131,10 @@ def _success_rows(
 ) -> list[list[str]]:
     title = POLICIES[policy].title
     papers = [_printed(printed.get(policy, {}).get(column)) for column in columns]
-    by_papers_rule = [
-        _with_tasks(results, policy, tasks, _spread(results.papers_rule(tasks, policy), 100))
-        for tasks in columns.values()
-    ]
+    by_papers_rule = [_spread(results.papers_rule(tasks, policy), 100, tasks) for tasks in columns.values()]
     honest = [
-        _with_tasks(results, policy, tasks, _interval(results.honest(tasks, policy))) for tasks in columns.values()
+        _of_tasks(_interval(results.honest(tasks, policy)), results.n_evaluated(tasks, policy), tasks)
+        for tasks in columns.values()
     ]
     return [[title, "paper", *papers], ["", "ours, paper's rule", *by_papers_rule], ["", "ours, honest", *honest]]
 
@@ -144,7 +143,7 @@ def inference_table(results: Results) -> Table:
     """Table 2."""
     rows = []
     for policy in [policy for policy in POLICIES if policy in paper.MILLISECONDS]:
-        ours = [_spread(results.milliseconds(tasks, policy), 1) for tasks in COLUMNS.values()]
+        ours = [_spread(results.milliseconds(tasks, policy), 1, tasks) for tasks in COLUMNS.values()]
         papers = [_printed(paper.MILLISECONDS[policy].get(column)) for column in COLUMNS]
         calls = paper.NETWORK_CALLS[policy]
         rows += [[POLICIES[policy].title, "paper", str(calls), *papers], ["", "ours", str(calls), *ours]]
@@ -191,7 +190,7 @@ def task_table(results: Results) -> Table:
             if honest or rule:
                 printed = paper.of_task(task, policy)
                 names = ", ".join(map(str, seeds))
-                rows.append([task, policy, names, _printed(printed), _spread(rule, 100), _interval(honest)])
+                rows.append([task, policy, names, _printed(printed), _spread(rule, 100, (task,)), _interval(honest)])
     header = ["task", "policy", "seeds", "paper", "ours, paper's rule", "ours, honest"]
     return Table("tasks", "Every task: success [%]", setting_of(results), header, rows)
 
@@ -212,8 +211,11 @@ def _printed(number: paper.Printed | None) -> str:
     return f"{number.mean:.{n_digits}f} +- {number.spread:.{n_digits}f}"
 
 
-def _spread(value: tuple[float, float] | None, scale: float) -> str:
-    return MISSING if value is None else f"{scale * value[0]:.1f} +- {scale * value[1]:.1f}"
+def _spread(value: Spread | None, scale: float, tasks: Sequence[str]) -> str:
+    if value is None:
+        return MISSING
+    deviation = "" if value.deviation is None else f" +- {scale * value.deviation:.1f}"
+    return _of_tasks(f"{scale * value.mean:.1f}{deviation}", value.n_tasks, tasks)
 
 
 def _interval(estimate: Estimate | None) -> str:
@@ -223,10 +225,9 @@ def _interval(estimate: Estimate | None) -> str:
     return f"{mean:.1f} [{low:.1f}, {high:.1f}]"
 
 
-def _with_tasks(results: Results, policy: str, tasks: Sequence[str], text: str) -> str:
+def _of_tasks(text: str, n_there: int, tasks: Sequence[str]) -> str:
     """The text and, where some of several tasks are missing, of how many it is."""
-    there = [task for task in tasks if results.seeds(task, policy)]
-    return text if text == MISSING or len(there) == len(tasks) else f"{text} ({len(there)} of {len(tasks)} tasks)"
+    return text if text == MISSING or n_there == len(tasks) else f"{text} ({n_there} of {len(tasks)} tasks)"
 
 
 def _html(text: str) -> str:
@@ -245,13 +246,9 @@ def _latex(text: str) -> str:
 
 def _latex_cell(text: str) -> str:
     """A cell, narrow: what follows a number is small beside it, how many tasks it is of above it."""
-    number, spread, deviation = text.partition(" +- ")
-    deviation, _, tasks = deviation.partition(" (")
-    if spread:
-        return rf"${number}_{{\pm {deviation}}}${_raised(tasks)}"
-    found = re.fullmatch(r"(-?[\d.]+) (\[.*\])(?: \((.*))?", text)
-    return rf"${found[1]}_{{{found[2]}}}${_raised(found[3])}" if found else _latex(text)
-
-
-def _raised(tasks: str | None) -> str:
-    return rf"\textsuperscript{{{tasks.removesuffix(')')}}}" if tasks else ""
+    found = re.fullmatch(r"(-?[\d.]+)(?: \+- ([\d.]+)| (\[.*\]))?(?: \((.* tasks)\))?", text)
+    if not found:
+        return _latex(text)
+    number, deviation, interval, tasks = found.groups()
+    beside = rf"\pm {deviation}" if deviation else interval
+    return (rf"${number}_{{{beside}}}$" if beside else number) + (rf"\textsuperscript{{{tasks}}}" if tasks else "")

@@ -1,6 +1,7 @@
 """Demonstrations and training of a cell, by the commands that a user would type, each in a process of its own."""
 
 import errno
+import json
 import os
 import shutil
 import signal
@@ -114,7 +115,7 @@ def as_arguments(options: dict[str, Any]) -> list[str]:
 
 
 def _as_text(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    return json.dumps(value) if value is None or isinstance(value, bool) else str(value)
 
 
 def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | None = None) -> None:
