@@ -30,38 +30,59 @@ class Estimate(NamedTuple):
         return self.low > 0 or self.high < 0
 
 
-def wilson(rate: float, n_episodes: int) -> Estimate:
+def wilson(rate: float, n_episodes: float, critical: float = Z_95) -> Estimate:
     """A success rate with Wilson's interval, which stays inside [0, 1] also at 0 and 1.
 
     It is that of independent episodes. Trainings that are evaluated in the same episodes add none: their mean rate has
     at most this interval, as far as episodes go. (SciPy's takes whole numbers of successes, which a mean's are not.)
     """
-    squared = Z_95**2
+    squared = critical**2
     centre = (rate + squared / (2 * n_episodes)) / (1 + squared / n_episodes)
     spread = rate * (1 - rate) / n_episodes + squared / (4 * n_episodes**2)
-    half = Z_95 * math.sqrt(spread) / (1 + squared / n_episodes)
+    half = critical * math.sqrt(spread) / (1 + squared / n_episodes)
     return Estimate(rate, min(rate, max(0.0, centre - half)), max(rate, min(1.0, centre + half)))
 
 
-def mean_over_tasks(tasks: Sequence[Successes], bounds: tuple[float, float] = (0.0, 1.0)) -> Estimate:
-    """The mean over tasks of the mean over seeds and episodes, with Student's interval.
+def mean_rate(tasks: Sequence[Successes]) -> Estimate:
+    """The mean success over tasks, with Wilson's interval of as many episodes as its variance is worth.
 
-    Stratified by task. Episodes and seeds are crossed: the mean would be another with other episodes, which all seeds
-    share, and with other seeds. Of one seed only the episodes' part is known. The degrees of freedom are Welch's and
-    Satterthwaite's. Where no episode and no seed differs from another, as at 100 %, the interval has no width.
+    That of surveys (Dean and Pagano, 2015). Near 100 % Student's is too narrow: of four tasks between 99 and 100 % it
+    holds the truth in 83 % of cases. Where nothing differs from anything, as at 100 %, the episodes are counted.
 
     Args:
         tasks: at least one.
-        bounds: what a mean can be: 0 to 1 of rates, -1 to 1 of differences.
+    """
+    mean, variance, critical = _stratified(tasks)
+    if variance > 0:
+        return wilson(mean, mean * (1 - mean) / variance, critical)
+    return wilson(mean, len(tasks) ** 2 / sum(1 / successes.shape[1] for successes in tasks))
+
+
+def mean_difference(tasks: Sequence[Successes]) -> Estimate:
+    """The mean over tasks of two policies' differences, with Student's interval.
+
+    Args:
+        tasks: at least one. Where no episode and no seed differs from another, the interval has no width.
+    """
+    mean, variance, critical = _stratified(tasks)
+    half = critical * math.sqrt(variance)
+    return Estimate(mean, max(-1.0, mean - half), min(1.0, mean + half))
+
+
+def _stratified(tasks: Sequence[Successes]) -> tuple[float, float, float]:
+    """The mean over tasks of the mean over seeds and episodes, its variance, and Student's quantile for it.
+
+    Stratified by task. Episodes and seeds are crossed: the mean would be another with other episodes, which all seeds
+    share, and with other seeds. Of one seed only the episodes' part is known. The degrees of freedom are Welch's and
+    Satterthwaite's.
     """
     mean = float(np.mean([successes.mean() for successes in tasks]))
     parts = [part for successes in tasks for part in _variances(successes)]
     variance = sum(part for part, _ in parts)
     if variance == 0:
-        return Estimate(mean, mean, mean)
+        return mean, 0.0, Z_95
     freedom = variance**2 / sum(part**2 / degrees for part, degrees in parts)
-    half = float(stdtrit(freedom, 0.975)) * math.sqrt(variance) / len(tasks)
-    return Estimate(mean, max(bounds[0], mean - half), min(bounds[1], mean + half))
+    return mean, variance / len(tasks) ** 2, float(stdtrit(freedom, 0.975))
 
 
 def _variances(successes: Successes) -> list[tuple[float, int]]:

@@ -11,7 +11,7 @@ import numpy as np
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import POLICIES, Cell
 from lerobot_uca.protocol.folder import RunFolder, first_difference, write_json
-from lerobot_uca.protocol.intervals import Estimate, Successes, mean_over_tasks, wilson
+from lerobot_uca.protocol.intervals import Estimate, Successes, mean_difference, mean_rate, wilson
 from lerobot_uca.protocol.rows import CorruptRow, Row, write_rows
 from lerobot_uca.protocol.setting import FIRST_TUNING_SEED, Setting
 
@@ -129,13 +129,13 @@ class Results:
         return sum(bool(self.seeds(task, policy)) for task in tasks)
 
     def honest(self, tasks: Sequence[str], policy: str) -> Estimate | None:
-        """Success on those of the tasks that are there: Wilson's interval for one task, else Student's."""
+        """Success on those of the tasks that are there: Wilson's interval, for one task of its episodes."""
         there = [found for task in tasks if (found := self.successes(task, policy)) is not None]
         if not there:
             return None
         if len(tasks) == 1:
             return wilson(float(there[0].mean()), there[0].shape[1])
-        return mean_over_tasks(there)
+        return mean_rate(there)
 
     def difference(self, policy: str, other: str, tasks: Sequence[str]) -> tuple[Estimate, list[str]] | None:
         """Success of policy minus other in the same episodes, on the tasks that both have, and those tasks.
@@ -143,7 +143,7 @@ class Results:
         Paired by task, training seed and episode.
         """
         paired = {task: pairs for task in tasks if (pairs := self._pairs(task, policy, other)) is not None}
-        return (mean_over_tasks(list(paired.values()), bounds=(-1, 1)), list(paired)) if paired else None
+        return (mean_difference([*paired.values()]), list(paired)) if paired else None
 
     def _pairs(self, task: str, policy: str, other: str) -> Successes | None:
         both = sorted({*self.seeds(task, policy)} & {*self.seeds(task, other)})

@@ -16,9 +16,9 @@ MISSING = "missing"
 RULES = (
     "Each policy has three lines: the paper's number; ours by the paper's rule, the mean of the best five evaluations "
     "during training, of each seed, which selects on the episodes it reports; ours by the honest rule, the last "
-    "checkpoint in fresh episodes, with a 95 % interval (Wilson's for one task; for means Student's, from how seeds "
-    "and episodes differ within each task). Tasks count alike, however many seeds they have; +- is the standard "
-    "deviation over the seeds that have all of the tasks, where there are several."
+    "checkpoint in fresh episodes, with a 95 % interval (Wilson's; of a mean, from how seeds and episodes differ "
+    "within each task). Tasks count alike, however many seeds they have; +- is the standard deviation over the seeds "
+    "that have all of the tasks, where there are several."
 )
 
 
@@ -172,7 +172,7 @@ def difference_table(results: Results) -> Table:
         )
     caption = (
         "Paired by task, training seed and episode, over the tasks that both policies have; honest rule, points of "
-        f"success with a 95 % interval. Undecided where the interval holds 0. {setting_of(results)}"
+        f"success with a 95 % interval, Student's. Undecided where the interval holds 0. {setting_of(results)}"
     )
     return Table(
         "differences", "Differences between policies", caption, ["difference", "tasks", "points", "verdict"], rows
