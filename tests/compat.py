@@ -23,8 +23,9 @@ CORE = (
         "point_clouds/test_ray_casting.py",
     ),
     *("data/test_batched_dataset.py", "trust/test_checkpoints.py", "trust/test_hostile_checkpoints.py"),
+    *("data/test_whole_folder.py", "protocol/test_intervals.py"),
 )
-"""What depends on LeRobot, PyTorch, MuJoCo, Gymnasium and the engines. Console commands are not among it."""
+"""What depends on LeRobot, PyTorch, MuJoCo, Gymnasium, the engines, filelock and SciPy, but for console commands."""
 
 
 def declared() -> list[Requirement]:
