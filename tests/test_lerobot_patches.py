@@ -271,6 +271,19 @@ def test_a_policy_that_cannot_be_loaded_is_named_with_its_options(tmp_path):
         load()
 
 
+def test_a_training_does_not_leave_use_amp_aside_silently(dataset_root, tmp_path):
+    """LeRobot would train in float32, and lerobot-eval then evaluate the checkpoint in bfloat16."""
+
+    def validate(**changes: object) -> None:
+        dataset = DatasetConfig(repo_id="test/random", root=str(dataset_root))
+        policy = make_config(use_amp=True, **changes)
+        TrainPipelineConfig(dataset=dataset, policy=policy, output_dir=tmp_path / "training").validate()
+
+    with pytest.raises(UserError, match=r"policy\.use_amp is lerobot-eval's, .* --policy\.dtype=bfloat16 trains in bf"):
+        validate()
+    validate(dtype="bfloat16")
+
+
 def test_an_evaluation_imitates_no_bfloat16(monkeypatch, caplog, tmp_path):
     UCAFlowPolicy(make_config()).save_pretrained(tmp_path / "policy")
 

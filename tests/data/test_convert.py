@@ -283,6 +283,42 @@ def test_a_folder_of_files(tmp_path, kind):
         assert set(map(tuple, frame[OBS_POINT_CLOUD].numpy())) <= set(map(tuple, cloud))
 
 
+def test_an_episode_of_one_frame_is_named(tmp_path):
+    write_folder(tmp_path / "recorded", "npz", n_frames=5)
+    with pytest.raises(UserError, match="Episode 2 must have at least 2 frames, got 1: leave it out by --episodes"):
+        convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5))
+    assert not (tmp_path / "clouds").exists()
+    assert convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, episodes=[0, 1])).num_episodes == 2
+
+
+@pytest.mark.parametrize("key", ["observation.state", "action"])
+def test_a_dataset_without_what_is_learned(tmp_path, key):
+    features = {
+        OBS_POINT_CLOUD: {"dtype": "float32", "shape": (32, 3), "names": None},
+        "observation.state": {"dtype": "float32", "shape": (9,), "names": None},
+        "action": {"dtype": "float32", "shape": (4,), "names": None},
+    }
+    del features[key]
+    write_dataset(tmp_path / "data", features=features)
+    with pytest.raises(UserError, match=rf"must have observation\.state and action; {key} is missing"):
+        convert(config(tmp_path / "data", tmp_path / "clouds"))
+
+
+@pytest.mark.parametrize("damage", ["info", "rows", "no rows"])
+def test_a_damaged_dataset_is_one_line(tmp_path, damage):
+    write_dataset(tmp_path / "data")
+    (rows,) = (tmp_path / "data" / "data").rglob("*.parquet")
+    if damage == "info":
+        (tmp_path / "data" / "meta" / "info.json").write_text("{")
+    elif damage == "rows":
+        rows.write_bytes(rows.read_bytes()[:500])
+    else:
+        rows.unlink()
+    with pytest.raises(UserError, match=r"data' cannot be read: ") as error:
+        convert(config(tmp_path / "data", tmp_path / "clouds"))
+    assert "\n" not in str(error.value)
+
+
 def test_colours_of_ply_files(tmp_path):
     write_folder(tmp_path / "recorded", "ply")
     dataset = convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, colour=True))

@@ -207,6 +207,12 @@ def test_an_old_onnxruntime(exported, monkeypatch):
         (np.full((N_POINTS, 3), np.nan), np.zeros(N_STATES), "'point_cloud' must be finite"),
         (np.zeros((N_POINTS, 3)), np.full(N_STATES, np.inf), "'state' must be finite"),
         (np.zeros((N_POINTS, 3)), np.full(N_STATES, 1e30), r"'state' must lie within \+-1e\+12, got 1\.0e\+30"),
+        (
+            np.zeros((N_POINTS, 3)),
+            np.full(N_STATES, 1e8),
+            r"unlike training's: normalised it must lie within \+-1e\+06",
+        ),
+        (np.full((N_POINTS, 3), -1e8), np.zeros(N_STATES), "unlike training's: normalised .* Check the sensor"),
     ],
 )
 def test_observations_of_wrong_shapes(exported, point_cloud, state, message):
@@ -256,15 +262,39 @@ def test_further_channels_are_left_out_and_said_once(exported, caplog):
     assert caplog.messages == ["The cloud has 6 channels: the first 3 are taken."]
 
 
+def test_what_the_policy_refuses_the_runner_refuses(checkpoint, exported):
+    """At the same value, in normalised units: a sensor's glitch must not move a robot."""
+    policy = UCAFlowPolicy.from_pretrained(checkpoint).eval()
+    pre, _ = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
+    runner = OnnxPolicy(exported, seed=0)
+    n_refused = 0
+    for size in 10.0 ** np.arange(2, 10):
+        cloud, state = np.zeros((N_POINTS, 3), np.float32), np.zeros(N_STATES, np.float32)
+        state[3] = size
+        policy.reset()
+        runner.reset()
+        batch = pre({OBS_POINT_CLOUD: torch.from_numpy(cloud), "observation.state": torch.from_numpy(state)})
+        try:
+            policy.select_action(batch)
+        except UserError:
+            n_refused += 1
+            with pytest.raises(ValueError, match="unlike training's"):
+                runner.select_action(cloud, state)
+        else:
+            runner.select_action(cloud, state)
+    assert 0 < n_refused < 8
+
+
 class Diverged(torch.nn.Module):
     def forward(self, point_cloud, state, noise):
-        return (noise + point_cloud.sum() + state.sum()) * torch.inf
+        return (noise + point_cloud.sum() + state.sum()) * torch.inf, state.abs().amax()
 
 
 def test_infinite_actions_are_never_returned(tmp_path):
     shapes = {"point_cloud": (2, N_POINTS, 3), "state": (2, N_STATES), "noise": (4, N_ACTIONS)}
     inputs = tuple(torch.zeros(shape) for shape in shapes.values())
-    torch.onnx.export(Diverged(), inputs, str(tmp_path / "policy.onnx"), dynamo=False, input_names=list(shapes))
+    names = {"dynamo": False, "input_names": list(shapes), "output_names": list(onnx_runner.OUTPUTS)}
+    torch.onnx.export(Diverged(), inputs, str(tmp_path / "policy.onnx"), **names)
     with pytest.raises(ValueError, match="The actions are NaN or infinite, the inputs are not"):
         OnnxPolicy(tmp_path / "policy.onnx").select_action(np.zeros((N_POINTS, 3)), np.zeros(N_STATES))
 

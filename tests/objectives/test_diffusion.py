@@ -29,7 +29,7 @@ def posterior_mean(z: torch.Tensor, k: torch.Tensor, o: torch.Tensor) -> torch.T
     return MEAN + gain * (z - a.sqrt() * MEAN)
 
 
-@pytest.mark.parametrize("n_steps", [1, 10])
+@pytest.mark.parametrize("n_steps", [2, 10])
 def test_sampling_is_ddim(n_steps):
     """Clean actions are predicted and clipped; each step goes to the noise level before, without new noise."""
 
@@ -52,11 +52,13 @@ def test_sampling_is_ddim(n_steps):
     assert calls == expected_calls == [[k, k] for k in steps]
 
 
-def test_the_best_prediction_turns_noise_into_data():
+@pytest.mark.parametrize(("n_steps", "least"), [(2, 0), (10, 0.6), (50, 0.85), (K, 0.9)])
+def test_the_best_prediction_turns_noise_into_data(n_steps, least):
+    """Fewer steps give less of its spread."""
     noise = torch.randn(20_000, 1, 1, dtype=torch.float64)
-    x = ddim_sample(posterior_mean, make_scheduler(K), noise, torch.empty(20_000, 0), n_steps=K)
-    assert x.mean() == pytest.approx(MEAN, abs=0.005)
-    assert x.std() == pytest.approx(STD, rel=0.1)
+    x = ddim_sample(posterior_mean, make_scheduler(K), noise, torch.empty(20_000, 0), n_steps=n_steps)
+    assert x.mean() == pytest.approx(MEAN, abs=0.005 if n_steps > 2 else 0.01)
+    assert least * STD < x.std() < 1.1 * STD
 
 
 def test_the_loss_is_smallest_at_the_best_prediction():

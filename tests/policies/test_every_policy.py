@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from tests.builders import (
@@ -139,6 +139,20 @@ def test_training_in_bfloat16(variant):
     assert actions.dtype == torch.float32
 
 
+@every_policy
+def test_a_loss_in_inference_mode_is_that_without_gradients(variant):
+    policy = make(variant).eval()
+    batch = make_batch(policy.config)
+    losses = []
+    for mode in (torch.no_grad, torch.inference_mode):
+        torch.manual_seed(0)
+        with mode():
+            losses.append(policy.forward(batch)[0])
+    assert torch.equal(*losses)
+    with torch.inference_mode():
+        assert policy.forward(make_batch(policy.config))[0].isfinite()
+
+
 @pytest.mark.parametrize(("name", "n_steps"), [("dp3", 50), ("flowpolicy", 150), ("mp1", 150)])
 def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
     assert overfit(make(name, unet_widths=(32, 64), ema_power=0.6), n_steps) < 0.4
@@ -154,7 +168,11 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
         ("simple_dp3", {"unet_groups": 0}, "policy.unet_groups must be at least 1, got 0"),
         ("simple_dp3", {"unet_kernel_size": 4}, "policy.unet_kernel_size must be odd, got 4"),
         ("flowpolicy", {"time_dim": 7}, "policy.time_dim must be even, got 7"),
-        ("simple_dp3", {"n_inference_steps": 101}, "must be at most n_training_steps = 100, got 101"),
+        ("simple_dp3", {"n_inference_steps": 101}, "must be at least 2 and divide n_training_steps = 100, got 101"),
+        ("dp3", {"n_inference_steps": 51}, "must be at least 2 and divide n_training_steps = 100, got 51"),
+        ("dp3", {"n_inference_steps": 1}, "must be at least 2 and divide n_training_steps = 100, got 1"),
+        ("dp3", {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}}, "ACTION: MIN_MAX .* got MEAN_STD"),
+        ("simple_dp3", {"normalization_mapping": {}}, "for 'simple_dp3', .* got IDENTITY"),
         ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be one of eager, openvino, "),
         ("flowpolicy", {"delta": 0.0}, "policy.delta must be above 0, got 0.0"),
         ("flowpolicy", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),

@@ -160,6 +160,12 @@ def bad_inputs(tmp_path):
         "board.dictionary must be one of OpenCV's": settings(
             board_folder=no_picture, board=dataclasses.replace(BOARD, dictionary="DICT_9")
         ),
+        "and markers smaller than these, got board.squares=.7, 5., board.square=0.03, board.marker=0.05": settings(
+            board_folder=no_picture, board=dataclasses.replace(BOARD, square=0.03, marker=0.05)
+        ),
+        "at least 3 x 3 squares": settings(board_folder=no_picture, board=dataclasses.replace(BOARD, squares=(1, 1))),
+        "serial names the file, so it must have a character": settings(points=points, serial=""),
+        "and no slash, got '../a'": settings(points=points, serial="../a"),
         "fx, fy must be pixels": settings(points=points, intrinsics=(640.0, 480.0, 1.9, 1.9, 320.0, 240.0)),
     }
 
@@ -168,3 +174,11 @@ def test_wrong_input_is_one_line(tmp_path):
     for message, config in bad_inputs(tmp_path).items():
         with pytest.raises(UserError, match=message):
             calibrate(config)
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
+    points = write_points(tmp_path / "touched.csv", pixels=False)
+    (tmp_path / "file").touch()
+    options = ["--camera=front", "--serial=123456", "--intrinsics=[640,480,605,604,321,243]", f"--points={points}"]
+    with pytest.raises(UserError, match=r"--folder '.*file' cannot be written"):
+        run(monkeypatch, *options, f"--folder={tmp_path / 'file'}")

@@ -1,8 +1,11 @@
+import numpy as np
 import pytest
 import torch
-from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config
+from lerobot.policies import make_pre_post_processors
+from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config, make_statistics, write_dataset
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from lerobot_uca.visual.saliency import main, moments_of, saliency
 
@@ -61,6 +64,33 @@ def test_moments_are_in_the_datasets_units(checkpoint, dataset_root):
     assert moments.points.shape == (4, N_POINTS, 3)
     assert moments.saliency.max(axis=1) == pytest.approx(1)
     assert moments.actions.shape == (4, 3, N_ACTIONS)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_points_shown_are_those_that_the_policy_saw(tmp_path, masked):
+    """Fewer than the cloud has, which lies under another plugin's name, in no order, and perhaps with a mask."""
+    features = {
+        "observation.pointcloud.xyz": {"dtype": "float32", "shape": (N_POINTS, 3), "names": None},
+        "observation.state": {"dtype": "float32", "shape": (N_STATES,), "names": None},
+        "action": {"dtype": "float32", "shape": (N_ACTIONS,), "names": None},
+    }
+    if masked:
+        features["observation.pointcloud.valid_mask"] = {"dtype": "bool", "shape": (N_POINTS,), "names": None}
+    dataset = write_dataset(tmp_path / "data", features=features)
+    policy = UCAFlowPolicy(make_config(n_points=8)).eval()
+    policy.save_pretrained(tmp_path / "policy")
+    for processor in make_pre_post_processors(policy.config, dataset_stats=make_statistics()):  # changes no value
+        processor.save_pretrained(tmp_path / "policy")
+    moments = moments_of(tmp_path / "policy", tmp_path / "data", episode=0)
+    for step, points, values in zip(moments.steps, moments.points, moments.saliency, strict=True):
+        history = [dataset[max(0, step - 1)], dataset[step]]
+        names = [name for name in history[0] if name.startswith("observation.")]
+        pre, _ = make_pre_post_processors(policy.config, pretrained_path=str(tmp_path / "policy"))
+        batch = pre({name: torch.stack([frame[name] for frame in history])[None] for name in names})
+        cloud, state = batch[OBS_POINT_CLOUD], batch["observation.state"]
+        np.testing.assert_allclose(points, cloud[0, -1], atol=1e-6)
+        expected = saliency(policy, cloud, state, torch.zeros(1, policy.config.horizon, N_ACTIONS))[0]
+        np.testing.assert_allclose(values, expected / expected.max(), atol=1e-5)
 
 
 def test_what_is_not_there(checkpoint, dataset_root, tmp_path):

@@ -4,6 +4,7 @@ import socket
 import sys
 import urllib.request
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE
+from lerobot_uca.visual import live_camera
 from lerobot_uca.visual import view as command
 from lerobot_uca.visual.crop_page import INSIDE, OUTSIDE, colours_of, write_crop
 from lerobot_uca.visual.view import ViewConfig, clouds_of, record, view
@@ -134,10 +136,56 @@ def test_the_crop_is_written_into_a_training_configuration(tmp_path):
         "batch_size": 64,
     }
     file.write_text("- 1")
-    with pytest.raises(UserError, match="must be a training configuration, got list"):
+    for text, message in {
+        "- 1": "mine.yaml' must hold options of a training by name, got list",
+        "policy: uca_flow": "policy in .*mine.yaml' must hold options of a training by name, got str",
+        "policy: {depth: 3}": "policy.depth in .*mine.yaml' must hold options of a training by name, got int",
+    }.items():
+        file.write_text(text)
+        with pytest.raises(UserError, match=message):
+            write_crop(file, CROP)
+        assert file.read_text() == text
+    for text in ("", "policy:", "policy:\n  depth:"):
+        file.write_text(text)
         write_crop(file, CROP)
+        assert yaml.safe_load(file.read_text())["policy"]["depth"]["crop_low"] == list(CROP.low)
+    (tmp_path / "train.json").write_text("{}")
+    with pytest.raises(UserError, match=r"into a YAML file, such as crop\.yaml, got"):
+        write_crop(tmp_path / "train.json", CROP)
+    assert (tmp_path / "train.json").read_text() == "{}"
     with pytest.raises(UserError, match="Cannot write"):
         write_crop(tmp_path / "missing" / "mine.yaml", CROP)
+
+
+class DyingCamera:
+    """Gives one frame; then its thread has ended, as LeRobot's RealSense camera says it."""
+
+    use_depth, serial_number, width, height = True, "", 64, 48
+
+    def __init__(self):
+        self.frames, self.is_connected = [live_frame(0)], True
+
+    def connect(self):
+        pass
+
+    def disconnect(self):
+        self.is_connected = False
+
+    def read_latest_depth(self):
+        if not self.frames:
+            raise RuntimeError("RealSense read thread is not running.")
+        return self.frames.pop()
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_a_camera_that_dies_is_said_in_a_line(monkeypatch):
+    camera = DyingCamera()
+    monkeypatch.setattr(live_camera, "make_cameras_from_configs", lambda _: {"front": camera})
+    clouds = live_camera.live_clouds(SimpleNamespace(use_depth=True, type="stub"), "front", None, CROP, 100)
+    assert next(clouds).shape[1] == 3
+    with pytest.raises(UserError, match=r"Camera 'front' gives no cloud: RealSense read thread is not running\."):
+        next(clouds)
+    assert not camera.is_connected
 
 
 def test_wrong_input(depth_dataset, tmp_path, monkeypatch):
@@ -159,6 +207,8 @@ def test_what_cannot_be_shown_is_one_line(depth_dataset, tmp_path):
         list(view(ViewConfig(source=depth_dataset.root, crop_low=(0, 0, 0), output=tmp_path / "a.png")))
     with pytest.raises(UserError, match=r"Cannot write '.*none/a.rrd'"):
         list(view(ViewConfig(source=depth_dataset.root, rrd=tmp_path / "none" / "a.rrd")))
+    with pytest.raises(UserError, match=r"--output needs a picture's ending, such as '.*/cloud.png'"):
+        list(view(ViewConfig(source=depth_dataset.root, output=tmp_path / "cloud")))
     with pytest.raises(UserError, match="The first frame has no point"):
         command.crop_of(ViewConfig(source=depth_dataset.root), np.empty((0, 3), np.float32))
 

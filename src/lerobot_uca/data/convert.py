@@ -141,6 +141,10 @@ def make_source(config: ConvertConfig) -> Source:
 def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
     """Read and sample one episode."""
     frames = source.frames(episode)
+    if len(frames) < 2:  # of one frame LeRobot's statistics of a cloud have another shape
+        raise UserError(
+            f"Episode {episode} must have at least 2 frames, got {len(frames)}: leave it out by --episodes."
+        )
     few = [index for index, frame in enumerate(frames) if frame.n_points < least_points(n_points)]
     clouds = [_sample(frame.points, n_points) for frame in frames]
     state, action = (np.stack([getattr(frame, name) for frame in frames]) for name in ("state", "action"))

@@ -17,7 +17,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_uca.deploy.onnx_runner import open_session
+from lerobot_uca.deploy.onnx_runner import OUTPUTS, open_session
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.inference.traced import to_onnx
@@ -84,8 +84,8 @@ class RawPolicy:
             "noise": (config.horizon, config.n_actions),
         }
 
-    def act(self, policy: PointCloudPolicy, point_cloud: Tensor, state: Tensor, noise: Tensor) -> Tensor:
-        """Actions (n_action_steps, A) from the latest steps and noise (T, A).
+    def act(self, policy: PointCloudPolicy, point_cloud: Tensor, state: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (n_action_steps, A) from the latest steps and noise (T, A), and the largest normalised observation.
 
         Args:
             point_cloud, state: (K, N, 3), with colours (K, N, 6), and (K, S), oldest first; all K steps from the first
@@ -93,7 +93,8 @@ class RawPolicy:
         """
         stride = policy.config.obs_stride
         batch = self._pre({OBS_POINT_CLOUD: point_cloud[None, ::stride], OBS_STATE: state[None, ::stride]})
-        return self._post(policy.predict_action_chunk(batch, noise=noise[None]))[0]
+        largest = torch.maximum(batch[OBS_POINT_CLOUD].abs().amax(), batch[OBS_STATE].abs().amax())
+        return self._post(policy.predict_action_chunk(batch, noise=noise[None]))[0], largest
 
 
 def export(checkpoint: str, output: Path, *, overwrite: bool = False) -> dict[str, tuple[int, ...]]:
@@ -111,7 +112,7 @@ def export(checkpoint: str, output: Path, *, overwrite: bool = False) -> dict[st
         raise UserError(f"'{output}' exists. Choose another --output, or replace it with --overwrite.")
     raw_policy = RawPolicy(checkpoint)
     shapes = raw_policy.input_shapes
-    model = to_onnx(raw_policy.act, raw_policy.policy, list(shapes.values()), list(shapes), ["action"])
+    model = to_onnx(raw_policy.act, raw_policy.policy, list(shapes.values()), list(shapes), OUTPUTS)
     _check_same_actions(model, raw_policy)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -144,9 +145,9 @@ def _folder(checkpoint: str) -> Path:
 def _check_same_actions(model: bytes, raw_policy: RawPolicy) -> None:
     random = np.random.default_rng(0)
     inputs = {name: random.normal(size=shape).astype(np.float32) for name, shape in raw_policy.input_shapes.items()}
-    (exported,) = open_session(model, "the exported policy").run(None, inputs)
+    exported, _ = open_session(model, "the exported policy").run(None, inputs)
     with torch.no_grad():
-        expected = raw_policy.act(raw_policy.policy, *map(torch.from_numpy, inputs.values())).numpy()
+        expected = raw_policy.act(raw_policy.policy, *map(torch.from_numpy, inputs.values()))[0].numpy()
     difference = np.abs(exported - expected).max() / np.abs(expected).max()
     if not difference < TOLERANCE:
         raise UserError(

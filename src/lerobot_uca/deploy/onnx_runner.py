@@ -18,8 +18,10 @@ import onnxruntime
 logger = logging.getLogger(__name__)
 
 INPUTS = ("point_cloud", "state", "noise")
+OUTPUTS = ("action", "largest")  # the latter of the normalised observation
 MIN_ONNXRUNTIME = (1, 12)  # the first with opset 17
 LARGEST = 1e12  # of far larger values onnxruntime makes NaN or arbitrary actions, since their squares are infinite
+LARGEST_NORMALISED = 1e6  # as the policy's: normalised values lie near [-1, 1]
 
 
 class OnnxPolicy:
@@ -32,7 +34,7 @@ class OnnxPolicy:
 
     Raises:
         ValueError: if the file is not such a policy or keeps weights in other files; if an observation has a wrong
-            shape, if it is not finite or huge, or if an action is not finite.
+            shape, if it is not finite or is huge beside training's, or if an action is not finite.
         RuntimeError: if onnxruntime is too old.
     """
 
@@ -41,6 +43,11 @@ class OnnxPolicy:
         shapes = {tensor.name: tuple(tensor.shape) for tensor in self._session.get_inputs()}
         if set(shapes) != set(INPUTS):
             raise ValueError(f"'{path}' must have the inputs {', '.join(INPUTS)}, got {', '.join(shapes)}.")
+        outputs = [tensor.name for tensor in self._session.get_outputs()]
+        if outputs != list(OUTPUTS):
+            raise ValueError(
+                f"'{path}' must have the outputs {', '.join(OUTPUTS)}, got {', '.join(outputs)}: export anew."
+            )
         self._n_steps, *self._cloud_shape = shapes["point_cloud"]
         self._state_shape = shapes["state"][1:]
         self._noise_shape = shapes["noise"]
@@ -57,7 +64,8 @@ class OnnxPolicy:
         """The next action (A,), from the newest point cloud and state (S,). Call it once every step.
 
         The cloud is (N, 3), or (N, 6) if the policy sees colours. The first of more channels are taken. More points
-        are sampled farthest point by farthest point, as the policy does.
+        are sampled farthest point by farthest point, as a policy with n_points does. One without, which looks at all
+        there are, is exported for as many as training's clouds had.
         """
         n_channels = np.shape(point_cloud)[-1] if np.ndim(point_cloud) == 2 else 0
         if n_channels > self._cloud_shape[1] and not self._has_said:
@@ -86,7 +94,12 @@ class OnnxPolicy:
             "state": _checked("state", states, (self._n_steps, *self._state_shape)),
             "noise": _checked("noise", noise, self._noise_shape),
         }
-        (actions,) = self._session.run(None, values)
+        actions, largest = self._session.run(None, values)
+        if not largest <= LARGEST_NORMALISED:
+            raise ValueError(
+                f"The observation is unlike training's: normalised it must lie within +-{LARGEST_NORMALISED:.0e}, "
+                f"got {float(largest):.1e}. Check the sensor."
+            )
         if not np.isfinite(actions).all():  # a robot must never get them
             raise ValueError("The actions are NaN or infinite, the inputs are not: the policy's training diverged.")
         return actions

@@ -35,6 +35,7 @@ def check_settings() -> None:
                 raise UserError(" ".join(str(error).split())) from error
             if isinstance(self.policy, PointCloudPolicyConfig):
                 self.policy.validate_sizes()  # before the dataset is read: a horizon of 10^9 would fill the memory
+                _check_precision(self.policy)
                 if not self.job.is_remote:
                     check_output_folder(self.output_dir)
                     keep_others_out(Path(self.output_dir))
@@ -52,6 +53,15 @@ def check_settings() -> None:
 
     replace_method(TrainPipelineConfig, "validate", validated)
     replace_method(EvalPipelineConfig, "__post_init__", made)
+
+
+def _check_precision(policy: PointCloudPolicyConfig) -> None:
+    """LeRobot trains in `dtype`; lerobot-eval would then evaluate with the `use_amp` that training has left aside."""
+    if policy.use_amp and policy.dtype == "float32":
+        raise UserError(
+            "policy.use_amp is lerobot-eval's, training does not look at it: "
+            "--policy.dtype=bfloat16 trains in bfloat16."
+        )
 
 
 def _check_evaluation(config: EvalPipelineConfig, policy: PointCloudPolicyConfig) -> None:

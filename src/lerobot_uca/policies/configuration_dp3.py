@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import override
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 
 from lerobot_uca.bounds import within
 from lerobot_uca.errors import UserError
@@ -25,9 +25,17 @@ class DP3Config(UNetPolicyConfig):
     @override
     def validate_sizes(self) -> None:
         super().validate_sizes()
-        if self.n_inference_steps > self.n_training_steps:
+        mode = self.normalization_mapping.get("ACTION", NormalizationMode.IDENTITY)
+        if mode is not NormalizationMode.MIN_MAX:
             raise UserError(
-                f"policy.n_inference_steps must be at most n_training_steps = {self.n_training_steps}, "
+                f"policy.normalization_mapping must have ACTION: MIN_MAX for '{self.type}', whose samples are clipped "
+                f"to [-1, 1] as in the baselines' code, got {mode.value}: many actions would be out of reach."
+            )
+        # diffusers' steps are n_training_steps // n_inference_steps apart and end at 0: of 100, 51 would begin in the
+        # middle, one alone at 0, where the network takes pure noise for nearly clean actions.
+        if self.n_training_steps % self.n_inference_steps or self.n_inference_steps < min(2, self.n_training_steps):
+            raise UserError(
+                f"policy.n_inference_steps must be at least 2 and divide n_training_steps = {self.n_training_steps}, "
                 f"got {self.n_inference_steps}."
             )
         if self.inference == "compile":

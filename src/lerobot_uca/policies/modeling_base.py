@@ -8,7 +8,8 @@ Letters: B samples, O observation steps, N points, S state dimensions, T horizon
 import functools
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 from textwrap import shorten
@@ -53,6 +54,16 @@ def without_gradients[**P, R](method: Callable[P, R]) -> Callable[P, R]:
         return in_no_grad(*args, **kwargs) if torch.is_grad_enabled() else method(*args, **kwargs)
 
     return call
+
+
+@contextmanager
+def _without_inference_mode() -> Iterator[None]:
+    """In PyTorch's inference mode, which keeps no tangents, go on without gradients: UCA-Flow's loss has some."""
+    if not torch.is_inference_mode_enabled():
+        yield
+        return
+    with torch.inference_mode(mode=False), torch.no_grad():
+        yield
 
 
 class MethodLoss(NamedTuple):
@@ -134,8 +145,8 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         inputs.check_shape(ACTION, x, (len(observations.state), self.config.horizon, self.config.n_actions))
         mask = self._mask(batch, x)
         model = self.active_model
-        o = model.encoder(*observations)
-        with independent_draws(x.device):
+        with independent_draws(x.device), _without_inference_mode():
+            o = model.encoder(*observations)
             loss = self.compute_loss(model.generator, x, o, mask)
         parts = {name: value.mean().item() for name, value in loss.parts.items()}
         mean = loss.total.mean()

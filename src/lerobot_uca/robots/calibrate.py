@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 CAMERA_POINT, PIXEL = ("camera_x", "camera_y", "camera_z"), ("u", "v", "depth")
 BASE_POINT = ("base_x", "base_y", "base_z")
 POSE = ("x", "y", "z", "rx", "ry", "rz")
-MIN_CORNERS = 6
+MIN_SQUARES, MIN_CORNERS = 3, 6
 DEFAULT_FOLDER = Path("calibration")
 
 
@@ -87,6 +87,8 @@ def calibrate(config: CalibrateConfig) -> tuple[Calibration, Fit]:
     Raises:
         UserError: for data that are missing, wrong or do not determine the pose.
     """
+    if not config.serial or set(config.serial) & {"/", "\\"}:
+        raise UserError(f"serial names the file, so it must have a character and no slash, got '{config.serial}'.")
     if (config.points is None) == (config.board_folder is None):
         raise UserError("Give either --points (touched points) or --board_folder (pictures of a board).")
     width, height, fx, fy, cx, cy = config.intrinsics
@@ -134,6 +136,11 @@ def see_board(folder: Path, board: BoardConfig, camera: Camera) -> tuple[Array, 
     poses = _columns(file, rows, POSE)
     if not hasattr(cv2.aruco, board.dictionary):
         raise UserError(f"board.dictionary must be one of OpenCV's, such as DICT_4X4_50, got '{board.dictionary}'.")
+    if not (0 < board.marker < board.square and min(board.squares) >= MIN_SQUARES):
+        raise UserError(
+            f"A board has at least {MIN_SQUARES} x {MIN_SQUARES} squares and markers smaller than these, got "
+            f"board.squares={list(board.squares)}, board.square={board.square}, board.marker={board.marker}."
+        )
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     charuco = cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, dictionary)
     detector = cv2.aruco.CharucoDetector(charuco)
@@ -204,7 +211,10 @@ def run(config: CalibrateConfig) -> None:
     calibration, fit = calibrate(config)
     pose = calibration.camera.X_world_camera
     before = _previous(config)
-    file = calibration.write(config.folder)
+    try:
+        file = calibration.write(config.folder)
+    except OSError as error:
+        raise UserError(f"--folder '{config.folder}' cannot be written: {error}") from error
     worst = int(np.argmax(fit.mm))
     residual = ", ".join(f"{value:.2f} {unit}" for unit, value in calibration.residual.items())
     print(f"Camera '{config.camera}' in the {calibration.frame} frame at {np.round(calibration.camera.position, 4)} m.")

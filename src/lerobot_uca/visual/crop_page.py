@@ -97,18 +97,27 @@ def write_crop(file: Path, crop: Crop) -> None:
     """Write a crop as policy.depth of a training configuration; what else is in the file is kept.
 
     Raises:
-        UserError: if the file holds something else or cannot be written.
+        UserError: if the file is not YAML, holds something else or cannot be written.
     """
+    if file.suffix not in (".yaml", ".yml"):
+        raise UserError(f"The crop is written into a YAML file, such as crop.yaml, got '{file}'.")
     try:
         settings = yaml.safe_load(file.read_text(encoding="utf-8")) if file.exists() else {}
     except (OSError, yaml.YAMLError) as error:
         raise UserError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(settings, dict):
-        raise UserError(f"'{file}' must be a training configuration, got {type(settings).__name__}.")
-    depth = settings.setdefault("policy", {}).setdefault("depth", {})
+    settings = _options(settings, f"'{file}'")
+    policy = settings["policy"] = _options(settings.get("policy"), f"policy in '{file}'")
+    depth = policy["depth"] = _options(policy.get("depth"), f"policy.depth in '{file}'")
     depth["crop_low"], depth["crop_high"] = list(crop.low), list(crop.high)
     try:
         with whole_file(file) as unfinished:
             unfinished.write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
     except OSError as error:
         raise UserError(f"Cannot write '{file}': {error}") from error
+
+
+def _options(values: Any, what: str) -> dict[str, Any]:
+    """Options by name, none where nothing stands."""
+    if not isinstance(values, dict | None):
+        raise UserError(f"{what} must hold options of a training by name, got {type(values).__name__}.")
+    return values or {}

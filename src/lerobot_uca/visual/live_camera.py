@@ -43,7 +43,7 @@ def live_clouds(
         check_cameras({name: camera})
         while True:
             yield make.points([camera.read_latest_depth()], n_points)
-    except (DepthError, ConnectionError, TimeoutError) as error:
+    except (DepthError, ConnectionError, TimeoutError, RuntimeError) as error:  # the last of a thread that has ended
         raise UserError(f"Camera '{name}' gives no cloud: {error}") from error
     finally:
         camera.disconnect()

@@ -21,9 +21,10 @@ from torch.utils.data import default_collate
 
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation
+from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation, find_point_cloud, valid_mask
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
+from lerobot_uca.policies.processor_base import PointCloudProcessorStep
 from lerobot_uca.whole_file import whole_file
 
 N_MOMENTS = 4
@@ -77,20 +78,28 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
             f"'{dataset_root}' has {given}."
         )
     seconds = [step / dataset.fps for step in config.observation_delta_indices]
-    windows = dict.fromkeys((OBS_POINT_CLOUD, OBS_STATE), seconds)
+    key = find_point_cloud(dataset.meta.features)
+    if key is None:
+        raise UserError(f"'{dataset_root}' must have a point cloud, got {', '.join(dataset.meta.features)}.")
+    mask = valid_mask(key, dataset.meta.features)
+    seen = [key, OBS_STATE, *([mask] if mask else [])]
+    windows = dict.fromkeys(seen, seconds)
     dataset = BatchedDataset(dataset.repo_id, root=dataset_root, delta_timestamps=windows)
     of_episode = np.flatnonzero(np.asarray(dataset.hf_dataset["episode_index"]) == episode)
     steps = np.linspace(0, len(of_episode) - 1, n_moments).round().astype(int).tolist()
     raw = default_collate(dataset.__getitems__([int(of_episode[step]) for step in steps]))
-    batch = preprocess({key: raw[key] for key in (OBS_POINT_CLOUD, OBS_STATE)})
-    cloud, state = batch[OBS_POINT_CLOUD][..., : config.n_points, :], batch[OBS_STATE]
+    points = PointCloudProcessorStep(config.n_points).uniform(
+        raw[key][:, -1], None if mask is None else raw[mask][:, -1]
+    )
+    batch = preprocess({each: raw[each] for each in seen})
+    cloud, state = batch[OBS_POINT_CLOUD], batch[OBS_STATE]
     noise = torch.zeros(len(steps), config.horizon, config.n_actions)  # the middle of what may be drawn
     values = saliency(policy, cloud, state, noise)
     with torch.no_grad():
-        actions = postprocess(policy.predict_action_chunk({**batch, OBS_POINT_CLOUD: cloud}, noise=noise))
+        actions = postprocess(policy.predict_action_chunk(batch, noise=noise))
     return Moments(
         steps=steps,
-        points=raw[OBS_POINT_CLOUD][:, -1, : cloud.shape[2], :3].numpy(),
+        points=points.numpy(),
         saliency=(values / values.amax(dim=1, keepdim=True).clamp_min(1e-12)).numpy(),
         states=raw[OBS_STATE][:, -1].numpy(),
         actions=actions.numpy(),

@@ -136,6 +136,8 @@ def crop_of(config: ViewConfig, points: NDArray[np.float32]) -> Crop:
 
 def draw(file: Path, points: NDArray[np.float32], crop: Crop) -> None:
     """A picture of a cloud from three sides."""
+    if not file.suffix:
+        raise UserError(f"--output needs a picture's ending, such as '{file}.png', got '{file}'.")
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

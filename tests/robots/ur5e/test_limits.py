@@ -24,6 +24,29 @@ def test_no_stream_of_targets_breaks_a_limit(seed):
     assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration * DT + 1e-9
 
 
+def test_a_joint_that_stands_outside_the_range_comes_back_as_slowly_as_it_is_told():
+    """As when the range was narrowed while the arm stood there: the driver's easing, a small step every 1/30 s."""
+    start, target, speed = np.full(6, 1.8), np.array([0.9, -0.9, 0.9, 0.0, 0.9, 0.9]), 0.25
+    interpolator = Interpolator(start, LIMITS)
+    n_steps = int(30 * 2.7 / speed)
+    path = [start]
+    for step in range(1, n_steps + 1):
+        interpolator.set_target(start + step / n_steps * (target - start), 1 / 30)
+        path += [interpolator.step(1 / 240).copy() for _ in range(8)]
+    velocity = np.diff(path, axis=0) * 240
+    assert np.abs(velocity).max() < 1.1 * speed
+    assert velocity.max() < 1e-9  # all joints go down, never out
+    share = (np.array(path) - start) / (target - start)
+    assert np.ptp(share, axis=1).max() < 0.02  # straight: all joints are as far
+    np.testing.assert_allclose(path[-1], target, atol=0.02)
+
+
+def test_a_joint_outside_the_range_goes_no_farther_out():
+    interpolator = Interpolator(np.full(6, 1.5), LIMITS)
+    interpolator.set_target(np.full(6, 3.0), duration=0.1)
+    assert max(interpolator.step(DT).max() for _ in range(100)) == 1.5
+
+
 def test_joints_arrive_stop_and_never_pass_the_target():
     target = np.array([0.5, -0.5, 0.1, 0.001, 0.0, 0.9])
     q, qd = REST, REST

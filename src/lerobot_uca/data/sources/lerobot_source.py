@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lerobot_uca.data.recorded_calibrations import EXTRINSICS, INTRINSICS, recorded_calibrations
 from lerobot_uca.data.sources.source import ACTION, STATE, Frame, Source
-from lerobot_uca.errors import UserError
+from lerobot_uca.errors import UserError, reported
 from lerobot_uca.features import POINT_CLOUD, VALID_MASK_SUFFIX, cloud_observation, find_point_cloud
 from lerobot_uca.point_clouds.depth import DepthError, is_valid
 from lerobot_uca.point_clouds.geometry import Crop
@@ -37,7 +37,15 @@ class LeRobotSource(Source):
     def _dataset(self) -> Any:
         from lerobot.datasets.lerobot_dataset import LeRobotDataset  # slow to import
 
-        return LeRobotDataset(self.path.name, root=self.path)
+        with reported(f"'{self.path}' cannot be read"):
+            dataset = LeRobotDataset(self.path.name, root=self.path)
+        missing = [key for key in (STATE, ACTION) if key not in dataset.features]
+        if missing:
+            raise UserError(
+                f"'{self.path}' must have {STATE} and {ACTION}; {', '.join(missing)} is missing, got "
+                f"{', '.join(dataset.features)}."
+            )
+        return dataset
 
     @property
     def features(self) -> dict[str, Any]:

@@ -71,9 +71,13 @@ class Interpolator:
         self._elapsed, self._duration = 0.0, 1.0
 
     def set_target(self, target: Array, duration: float) -> None:
-        """Go there, in that time [s] if the limits allow it. The joint range is held here, too."""
+        """Go there, in that time [s] if the limits allow it. The joint range is held here, too.
+
+        A joint that stands outside the range may come back to it as slowly as it is told, but go no farther out.
+        """
         self._start = self._reference()
-        self._target = np.clip(target, self._limits.lower, self._limits.upper)
+        lower, upper = np.minimum(self._limits.lower, self.q), np.maximum(self._limits.upper, self.q)
+        self._target = np.clip(target, lower, upper)
         self._elapsed, self._duration = 0.0, duration
 
     def _reference(self) -> Array:
