@@ -64,9 +64,9 @@ def curves(results: Results, plt: Any) -> Any:
 
 
 def curves_over_minutes(results: Results, plt: Any) -> Any:
-    """Success over minutes of training, a panel for each task that two policies or more have learned."""
+    """Success over minutes of training, a panel for each task that all policies, two or more, have learned."""
     n_policies = Counter(task for task, _ in {(cell.task, cell.policy) for cell in results.records})
-    tasks = [task for task in results.tasks if n_policies[task] > 1]
+    tasks = [task for task in results.tasks if n_policies[task] == len(results.policies) > 1]
     figure = _panels(results, plt, tasks, results.curve_over_minutes, "minutes of training")
     for axis, task in zip(figure.axes if figure else (), tasks, strict=False):
         axis.set_xlim(left=0)
