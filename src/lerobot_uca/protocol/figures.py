@@ -196,7 +196,7 @@ FIGURES: dict[str, Callable[[Results, Any], Any]] = {
 CAPTIONS = {
     "success_over_epochs": "Success in the evaluations during training; the band is from the lowest to the highest "
     "training seed.",
-    "success_over_minutes": "Success in the evaluations during training over its minutes, on tasks that two or more "
+    "success_over_minutes": "Success in the evaluations during training over its minutes, on the tasks that all "
     "policies have learned; dashed the paper's UCA-Flow, on the task or on its group where no more is printed.",
     "success_and_latency": "Success of the last checkpoints and the time for a chunk of actions: filled ours, with "
     "95 % interval, over the tasks that are there; hollow the paper's, over its 37 tasks.",
