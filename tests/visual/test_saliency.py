@@ -98,6 +98,12 @@ def test_what_is_not_there(checkpoint, dataset_root, tmp_path):
         moments_of(checkpoint, dataset_root, episode=3)
     with pytest.raises(UserError, match=r"has no config\.json"):
         moments_of(tmp_path / "none", dataset_root, episode=0)
+    with pytest.raises(UserError, match=r"none' must be a LeRobot dataset \(meta/info\.json\)\."):
+        moments_of(checkpoint, tmp_path / "none", episode=0)
+    (tmp_path / "damaged" / "meta").mkdir(parents=True)
+    (tmp_path / "damaged" / "meta" / "info.json").write_text("{")
+    with pytest.raises(UserError, match="damaged' cannot be read: JSONDecodeError"):
+        moments_of(checkpoint, tmp_path / "damaged", episode=0)
 
 
 def test_clouds_of_another_kind_than_trainings(policy, checkpoint, dataset_root):

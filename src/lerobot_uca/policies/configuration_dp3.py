@@ -31,8 +31,9 @@ class DP3Config(UNetPolicyConfig):
                 f"policy.normalization_mapping must have ACTION: MIN_MAX for '{self.type}', whose samples are clipped "
                 f"to [-1, 1] as in the baselines' code, got {mode.value}: many actions would be out of reach."
             )
-        # diffusers' steps are n_training_steps // n_inference_steps apart and end at 0: of 100, 51 would begin in the
-        # middle, one alone at 0, where the network takes pure noise for nearly clean actions.
+        # diffusers' steps are n_training_steps // n_inference_steps apart and end at 0. Where one number divides the
+        # other they begin one such distance before pure noise; of 100, 51 would begin 49 of them before, and one alone
+        # at 0, where the network takes pure noise for nearly clean actions.
         if self.n_training_steps % self.n_inference_steps or self.n_inference_steps < min(2, self.n_training_steps):
             raise UserError(
                 f"policy.n_inference_steps must be at least 2 and divide n_training_steps = {self.n_training_steps}, "

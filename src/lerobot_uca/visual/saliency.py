@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from lerobot_uca.data.batched_dataset import BatchedDataset
-from lerobot_uca.errors import UserError
+from lerobot_uca.errors import UserError, reported
 from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation, find_point_cloud, valid_mask
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
@@ -63,12 +63,15 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
     """Moments of a dataset's episode, evenly spaced.
 
     Raises:
-        UserError: if the checkpoint is not one of this package, there is no such episode, or one of policy and
-            dataset has the robot's own points and the other does not.
+        UserError: if the checkpoint is not one of this package, the dataset cannot be read or has no such episode, or
+            one of policy and dataset has the robot's own points and the other does not.
     """
     policy, preprocess, postprocess = _load(checkpoint)
     config = policy.config
-    dataset = BatchedDataset(f"local/{dataset_root.name}", root=dataset_root)
+    if not (dataset_root / "meta" / "info.json").is_file():  # LeRobot would ask the Hub for it
+        raise UserError(f"'{dataset_root}' must be a LeRobot dataset (meta/info.json).")
+    with reported(f"'{dataset_root}' cannot be read"):
+        dataset = BatchedDataset(f"local/{dataset_root.name}", root=dataset_root)
     if not 0 <= episode < dataset.num_episodes:
         raise UserError(f"--episode must be 0 to {dataset.num_episodes - 1}, got {episode}.")
     given = cloud_observation(dataset.meta.features)
