@@ -54,6 +54,26 @@ def test_a_library_that_swallows_the_end_changes_nothing():
     assert (result.returncode, result.stderr.strip()) == (143, "ended by SIGTERM")
 
 
+@pytest.mark.parametrize(("unbuffered", "code"), [("1", 128 + signal.SIGPIPE), ("", 0)])  # 0: printed at its end
+def test_a_command_whose_reader_ends_ends_without_a_line(unbuffered, code):
+    lines = "from lerobot_uca.processes import end_by_signals; end_by_signals(); input(); print('x')"
+    env = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    process = subprocess.Popen([sys.executable, "-c", lines], stdin=-1, stdout=-1, stderr=-1, text=True, env=env)
+    process.stdout.close()
+    _, err = process.communicate("\n")
+    assert (process.returncode, err) == (code, "")
+
+
+def test_another_broken_pipe_is_told():
+    lines = (
+        "from lerobot_uca.processes import end_by_signals; end_by_signals()\n"
+        "import socket; a, b = socket.socketpair(); b.close(); a.send(b'x')"
+    )
+    result = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert "BrokenPipeError" in result.stderr
+
+
 def test_a_signal_that_is_ignored_stays_ignored():
     code = (
         "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"

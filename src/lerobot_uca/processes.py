@@ -1,8 +1,10 @@
 """The end of processes: of a command by a signal, of a worker when its parent has ended."""
 
+import atexit
 import functools
 import multiprocessing
 import os
+import select
 import signal
 import sys
 import threading
@@ -22,9 +24,11 @@ def end_by_signals() -> None:
     """Let Ctrl-C, SIGTERM and SIGHUP end this command cleanly: one line, files removed, exit code 128 + number.
 
     Python prints a traceback for Ctrl-C, and the others end it without leaving any `with` block. To be called in the
-    main thread. A signal that something else handles already, or that is ignored (nohup), stays as it is.
+    main thread. A signal that something else handles already, or that is ignored (nohup), stays as it is. If whoever
+    reads its output ends (`| head`), it ends as well, without a line: SIGPIPE, which Python turns into an exception.
     """
     _report_interruption()
+    atexit.register(_hand_on)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
     for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP
@@ -64,6 +68,26 @@ def _end(number: int, _: FrameType | None) -> None:
     raise SystemExit(128 + number)
 
 
+def _hand_on() -> None:
+    """Hand on what has been printed, as Python does at its end, but drop it if nobody reads it."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _drop_output()
+
+
+def _drop_output() -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _nobody_reads() -> bool:
+    if not hasattr(select, "poll"):  # Windows
+        return False
+    poll = select.poll()
+    poll.register(sys.stdout, 0)  # a pipe without a reader is told in any case
+    return bool(poll.poll(0))
+
+
 def _report_interruption() -> None:
     previous = sys.excepthook
     if getattr(previous, "_reports_interruption", False):
@@ -73,6 +97,9 @@ def _report_interruption() -> None:
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
         if _received:
             raise SystemExit(128 + _received[0])
+        if issubclass(kind, BrokenPipeError) and _nobody_reads():  # it is not a robot's connection
+            _drop_output()
+            raise SystemExit(128 + signal.SIGPIPE)
         if not issubclass(kind, KeyboardInterrupt):
             previous(kind, error, traceback)
             return
