@@ -21,6 +21,9 @@ OBSERVATION_INFO = "observation"
 VALID_MASK_SUFFIX = ".valid_mask"
 """Appended to a cloud's key (without .xyz), it names which of its points are valid, (N,) bool."""
 
+INTRINSICS, EXTRINSICS = "observation.intrinsics.", "observation.extrinsics."
+"""Before a camera's name: its calibration beside depth images, (3, 3) [pixels] and (4, 4) [m], camera to world."""
+
 
 def find_point_cloud(keys: Iterable[str]) -> str | None:
     """The key of the point cloud among these, if there is one."""

@@ -1,6 +1,7 @@
 """Policies that see depth images: the same clouds in training, resumed, trained further, and on the robot."""
 
 import dataclasses
+import logging
 import sys
 
 import numpy as np
@@ -320,18 +321,96 @@ def test_training_from_depth_needs_a_crop(tiff, tmp_path):
         train(tiff, tmp_path / "out2", policy_config(depth=depth))
 
 
-def test_training_further_on_another_installations_data_is_refused(tiff, calibrated, tmp_path, monkeypatch):
-    fresh = train(tiff, tmp_path / "fresh", policy_config())
-    other = tmp_path / "other"
-    make_calibration(moved_camera(30)).write(other)
+def check_clouds_of(recipe, batches):
+    for clouds, indices in batches:
+        for cloud, index in zip(clouds[:, -1].numpy(), indices.tolist(), strict=True):
+            np.testing.assert_array_equal(cloud, normalised(recipe.make()([live_frame(index)])))
+
+
+def test_the_named_folder_counts_in_training_and_whenever_it_goes_on(tiff, seen, tmp_path, monkeypatch):
+    """Whatever LEROBOT_UCA_CALIBRATION names: a recording station has its own cameras."""
+    make_calibration().write(tmp_path / "named")
+    depth = dataclasses.replace(policy_config().depth, calibration=str(tmp_path / "named"))
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+    fresh = train(tiff, tmp_path / "fresh", policy_config(depth=depth))
+    resume(fresh, monkeypatch)
     further = UCAFlowConfig.from_pretrained(fresh)
     further.pretrained_path = fresh
-    further.depth.calibration = str(other)
-    with pytest.raises(UserError, match=r"in the dataset's camera 'front' is 30\.0 mm"):
-        train(tiff, tmp_path / "further", further)
-    monkeypatch.setenv(CALIBRATION_VARIABLE, str(other))
-    further.depth.calibration = None
-    assert train(tiff, tmp_path / "further2", further).is_dir()
+    train(tiff, tmp_path / "further", further)
+
+    make_calibration(moved_camera(30)).write(tmp_path / "stations")
+    monkeypatch.setenv(CALIBRATION_VARIABLE, str(tmp_path / "stations"))
+    depth.calibration = str(tmp_path / "named")
+    there = train(tiff, tmp_path / "there", policy_config(depth=depth))
+    resume(there, monkeypatch)
+    assert len(seen) == 5
+    check_clouds_of(make_recipe(), seen)
+    assert UCAFlowConfig.from_pretrained(there).depth.recipe == make_recipe().as_dict()
+
+
+@pytest.mark.parametrize("how", ["folder", "variable"])
+def test_training_further_on_another_installations_data(how, tiff, calibrated, seen, tmp_path, monkeypatch, caplog):
+    fresh = train(tiff, tmp_path / "fresh", policy_config())
+    make_calibration(moved_camera(30)).write(tmp_path / "other")
+    further = UCAFlowConfig.from_pretrained(fresh)
+    further.pretrained_path = fresh
+    if how == "folder":
+        further.depth.calibration = str(tmp_path / "other")
+    else:
+        monkeypatch.setenv(CALIBRATION_VARIABLE, str(tmp_path / "other"))
+    seen.clear()
+    # LeRobot's training takes the root's handlers away.
+    monkeypatch.setattr(logging.getLogger("lerobot_uca.policies.depth_config"), "handlers", [caplog.handler])
+    trained = train(tiff, tmp_path / "further", further)
+    moved = make_recipe(camera=moved_camera(30))
+    check_clouds_of(moved, seen)
+    assert UCAFlowConfig.from_pretrained(trained).depth.recipe == moved.as_dict()
+    assert [record.message for record in caplog.records if record.name.endswith("depth_config")] == [
+        "Compared with the checkpoint's training, camera 'front' is 30.0 mm and 0.00 deg from where it was."
+    ]
+
+
+def test_training_from_depth_reads_the_datasets_own_calibration(seen, tmp_path, monkeypatch):
+    camera, other = make_camera(), make_calibration(moved_camera(30))
+    other.write(tmp_path / "other")
+    monkeypatch.setenv(CALIBRATION_VARIABLE, str(tmp_path / "other"))
+    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float32)
+    own = {
+        "observation.intrinsics.front": lambda index: K,
+        "observation.extrinsics.front": lambda index: np.array(camera.X_world_camera, np.float32),
+    }
+    dataset = write_depth_dataset(tmp_path / "data", video=False, columns=own)
+    trained = train(dataset, tmp_path / "out", policy_config())
+    recipe = CloudRecipe.from_dict(UCAFlowConfig.from_pretrained(trained).depth.recipe)
+    assert recipe.sources[0].calibration.method == "recorded in the dataset"
+    check_clouds_of(recipe, seen)
+    np.testing.assert_allclose(recipe.sources[0].calibration.camera.position, camera.position, atol=1e-6)
+    with pytest.raises(UserError, match="holds the calibration of camera 'front', which lerobot-train and"):
+        policy_config().depth.settle(dataset.meta.features)  # from features alone
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"crop_low": (0.3, 0.0, 0.0), "crop_high": (0.5, 0.1, 0.1)}, "policy.depth.crop_low and crop_high do"),
+        ({"n_points": 1024}, "policy.depth.n_points do"),
+        ({"crop_low": CROP.low, "crop_high": CROP.high, "n_points": N_CLOUD_POINTS}, None),
+        ({}, None),
+    ],
+)
+def test_options_that_made_clouds_do_not_heed_are_told(changes, names, caplog):
+    depth = DepthConfig(**changes)
+    for _ in range(2):  # as often as LeRobot asks
+        assert depth.settle(features_made_with(make_recipe())) == make_recipe()
+    assert depth.n_points == N_CLOUD_POINTS
+    assert depth.crop_low in (None, CROP.low)
+    assert len(caplog.messages) == (names is not None)
+    assert (names or "") in caplog.text
+
+
+def test_one_corner_alone_is_refused(tiff, calibrated):
+    with pytest.raises(UserError, match="Give both crop_low and crop_high, or neither"):
+        DepthConfig(crop_low=CROP.low).settle(tiff.meta.features)
 
 
 def features_made_with(recipe):

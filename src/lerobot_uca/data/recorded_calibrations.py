@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.features import EXTRINSICS, INTRINSICS
 from lerobot_uca.point_clouds.calibration import Calibration, pose_difference
 from lerobot_uca.point_clouds.recipe import camera_of, depth_keys
 
 logger = logging.getLogger(__name__)
 
-INTRINSICS, EXTRINSICS = "observation.intrinsics.", "observation.extrinsics."
 STILL = (1.0, 0.1)
 """(mm, deg) A camera that moves less in a dataset is a fixed one."""
 

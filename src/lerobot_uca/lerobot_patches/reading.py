@@ -18,9 +18,11 @@ from tqdm import tqdm
 from lerobot_uca import configs
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
-from lerobot_uca.errors import reported
+from lerobot_uca.data.recorded_calibrations import recorded_calibrations
+from lerobot_uca.errors import UserError, reported
 from lerobot_uca.features import cloud_observation, find_point_cloud, valid_mask
 from lerobot_uca.lerobot_patches.replacing import replace
+from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_base import PointCloudProcessorStep
 
@@ -62,6 +64,7 @@ def normalise_what_is_trained() -> None:
         def make_train_eval_datasets(config: TrainPipelineConfig) -> Any:
             datasets = make(config)
             if isinstance(config.policy, PointCloudPolicyConfig):
+                _take_calibrations(config, config.policy, datasets[0])
                 for dataset in filter(None, datasets):
                     _normalise_by_chosen_episodes(config, config.policy, dataset)
             return datasets
@@ -69,6 +72,18 @@ def normalise_what_is_trained() -> None:
         return make_train_eval_datasets
 
     replace(factory.make_train_eval_datasets, checked)
+
+
+def _take_calibrations(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:
+    """Tell the policy which calibrations depth images bring along, and whether it knows theirs from before."""
+    recorded = {}
+    is_read = hasattr(dataset, "hf_dataset") and find_point_cloud(dataset.meta.features) is None  # not streamed
+    if is_read and not (policy.depth.calibration or config.resume):
+        try:
+            recorded = recorded_calibrations(dataset)
+        except CalibrationError as error:
+            raise UserError(str(error)) from error
+    policy.depth.know_calibrations(recorded, is_resumed=config.resume)
 
 
 def _normalise_by_chosen_episodes(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:

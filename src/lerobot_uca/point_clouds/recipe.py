@@ -235,18 +235,15 @@ def recipe_for(
     features: Features,
     crop: tuple[Any, Any] | None,
     n_points: int,
-    folder: str | None,
-    recorded: Mapping[str, Calibration] | None = None,
+    calibrations: Mapping[str, Calibration],
 ) -> CloudRecipe:
     """The recipe for all depth images of a dataset.
 
-    Calibrations are those of a folder or of $LEROBOT_UCA_CALIBRATION, but for cameras whose calibrations are recorded
-    in the dataset. A simulated camera comes with a recipe, in which its calibration and a crop are.
+    Calibrations come by camera. A simulated camera comes with a recipe, in which its calibration and a crop are.
 
     Raises:
         CalibrationError: if a calibration or the crop is missing.
     """
-    installed = {**(installed_calibrations(folder) or {}), **(recorded or {})}
     sources = []
     for key in depth_keys(features):
         info = features[key].get("info") or {}
@@ -256,7 +253,7 @@ def recipe_for(
             known = {camera_of(source.key): source.calibration for source in own.sources}
             calibration = calibration_of(camera_of(key), known)
         else:
-            calibration = calibration_of(camera_of(key), installed)
+            calibration = calibration_of(camera_of(key), calibrations)
         sources.append(depth_source(key, info, calibration))
     if crop is None:
         raise CalibrationError(

@@ -1,6 +1,7 @@
 """Options for a policy's cloud from a dataset's depth images, and the recipe that they become."""
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,18 +9,23 @@ import numpy as np
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import OBS_POINT_CLOUD, find_point_cloud
-from lerobot_uca.point_clouds.calibration import CalibrationError
+from lerobot_uca.features import EXTRINSICS, OBS_POINT_CLOUD, find_point_cloud
+from lerobot_uca.point_clouds.calibration import Calibration, CalibrationError
 from lerobot_uca.point_clouds.recipe import (
     RECIPE_INFO,
+    SIMULATED,
     CloudRecipe,
     Features,
+    camera_of,
     depth_keys,
     installed_calibrations,
+    optional_crop,
     recipe_for,
 )
 
 logger = logging.getLogger(__name__)
+
+DEFAULT_POINTS = 512
 
 
 @dataclass
@@ -31,14 +37,33 @@ class DepthConfig:
     # Highest corner of the crop.
     crop_high: tuple[float, float, float] | None = None
     # Points of the cloud. policy.n_points may look at fewer of them.
-    n_points: int = within(512, least=1, most=100_000)
+    n_points: int = within(DEFAULT_POINTS, least=1, most=100_000)
     # Folder of the cameras' calibrations, in training and on the robot; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
     # The recipe of training's clouds; written by training, not for users.
     recipe: dict[str, Any] | None = None
 
+    def __post_init__(self) -> None:
+        self._of_data: dict[str, Calibration] = {}  # by camera; of this process's training, and not saved
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the recipe is that of a training in this process, whose clouds are to be made by it as it is."""
+        return bool(self._of_data)
+
+    def know_calibrations(self, recorded: Mapping[str, Calibration], *, is_resumed: bool) -> None:
+        """Take note of the calibrations of a training's data, by camera, before it is settled.
+
+        Args:
+            recorded: those that the dataset holds. A folder that is named counts before them.
+            is_resumed: whether the data is what the checkpoint was trained on, whose recipe holds them.
+        """
+        self._of_data = _calibrations(self.recipe) if is_resumed else dict(recorded)
+
     def settle(self, features: Features) -> CloudRecipe | None:
         """The recipe for a dataset's features, which the configuration keeps; None if it has clouds of unknown origin.
+
+        LeRobot asks for it more than once in a training: the calibrations remain those of the first time.
 
         Raises:
             UserError: if depth images need a calibration or a crop that is not there, or if another recipe is kept.
@@ -46,11 +71,11 @@ class DepthConfig:
         check_bounds(self, "policy.depth")
         try:
             recipe = self._recipe_for(features)
+            if recipe is not None:
+                self._take(recipe, is_told=self.recipe is not None and find_point_cloud(features) is not None)
         except CalibrationError as error:
             raise UserError(str(error)) from error
         self.calibration = None  # a path of this machine; the recipe holds what was in it
-        if recipe is not None:
-            self.recipe = recipe.as_dict()
         return recipe
 
     def add_statistics(self, stats: dict[str, dict[str, Any]]) -> None:
@@ -72,17 +97,58 @@ class DepthConfig:
         keys = depth_keys(features)
         if not keys:
             return kept
-        recipe = recipe_for(features, self._crop(kept), kept.n_points if kept else self.n_points, self.calibration)
+        crop = kept.crop if kept else optional_crop(self.crop_low, self.crop_high)
+        recipe = recipe_for(
+            features,
+            None if crop is None else (crop.low, crop.high),
+            kept.n_points if kept else self.n_points,
+            self._calibrations_of({camera_of(key) for key in keys}, features),
+        )
         if kept is not None:
-            _check_same(kept, recipe)
+            _say_differences(kept, recipe)
         return recipe
 
-    def _crop(self, kept: CloudRecipe | None) -> tuple[Any, Any] | None:
-        if kept is not None:
-            return kept.crop.low, kept.crop.high
-        if self.crop_low is None or self.crop_high is None:
-            return None
-        return self.crop_low, self.crop_high
+    def _calibrations_of(self, cameras: set[str], features: Features) -> Mapping[str, Calibration]:
+        if self.calibration:
+            return installed_calibrations(self.calibration) or {}
+        if cameras <= self._of_data.keys():
+            return self._of_data
+        unread = [name for name in cameras - self._of_data.keys() if EXTRINSICS + name in features]
+        if unread:
+            raise CalibrationError(
+                f"The dataset holds the calibration of camera '{unread[0]}', which lerobot-train and "
+                "lerobot-uca-convert read. Use one of these, or name a folder with policy.depth.calibration."
+            )
+        of_checkpoint = _calibrations(self.recipe)
+        known = {**(installed_calibrations() or {}), **self._of_data}
+        for name in cameras & of_checkpoint.keys() - known.keys():
+            if of_checkpoint[name].method != SIMULATED:
+                logger.warning(
+                    "Camera '%s': the calibration of the checkpoint's training is used for this data, too (%s).",
+                    *(name, of_checkpoint[name].date or "no date"),
+                )
+        return {**of_checkpoint, **known}
+
+    def _take(self, recipe: CloudRecipe, *, is_told: bool) -> None:
+        """Hold what counts, and say which options do not, unless that has been told."""
+        crop = optional_crop(self.crop_low, self.crop_high)
+        ignored = [] if crop in (None, recipe.crop) else ["policy.depth.crop_low and crop_high"]
+        ignored += [] if self.n_points in (DEFAULT_POINTS, recipe.n_points) else ["policy.depth.n_points"]
+        if ignored and not is_told:
+            logger.warning(
+                "Clouds are as they have been made before, %d points of the crop %s to %s: %s do not count.",
+                *(recipe.n_points, list(recipe.crop.low), list(recipe.crop.high), " and ".join(ignored)),
+            )
+        if crop is not None:
+            self.crop_low, self.crop_high = recipe.crop.low, recipe.crop.high
+        self.n_points, self.recipe = recipe.n_points, recipe.as_dict()
+        self._of_data = _calibrations(self.recipe)
+
+
+def _calibrations(recipe: Mapping[str, Any] | None) -> dict[str, Calibration]:
+    """By camera."""
+    sources = CloudRecipe.from_dict(recipe).sources if recipe is not None else ()
+    return {camera_of(source.key): source.calibration for source in sources}
 
 
 def _further(kept: CloudRecipe | None, made_with: CloudRecipe | None) -> CloudRecipe | None:
@@ -100,17 +166,12 @@ def _further(kept: CloudRecipe | None, made_with: CloudRecipe | None) -> CloudRe
     return made_with
 
 
-def _check_same(kept: CloudRecipe, recipe: CloudRecipe) -> None:
-    """A checkpoint goes on making clouds as in its training, so its new data must be of the same installation."""
+def _say_differences(kept: CloudRecipe, recipe: CloudRecipe) -> None:
+    """A checkpoint goes on making clouds from the same images, and of data of another installation as that is."""
     if kept.keys != recipe.keys:
         raise CalibrationError(
             f"The checkpoint makes its cloud from {', '.join(kept.keys)}, the dataset has {', '.join(recipe.keys)}."
         )
-    installed = installed_calibrations()
-    uses = kept.with_calibrations(installed) if installed is not None else kept
-    differences = uses.differences(recipe)
+    differences = kept.differences(recipe)
     if differences:
-        raise CalibrationError(
-            f"The checkpoint would make clouds as in its own installation, but in the dataset's {differences[0]}. Let "
-            "LEROBOT_UCA_CALIBRATION name the dataset's calibrations, or convert it with lerobot-uca-convert first."
-        )
+        logger.warning("Compared with the checkpoint's training, %s.", "; ".join(differences))

@@ -52,10 +52,13 @@ def make_processors(
     config.validate_features()
     stats = settled_statistics(dataset_stats, config)
     steps = make_default_policy_processor_steps(config, stats)
+    depth_step = DepthToCloudProcessorStep(recipe=config.depth.recipe)
+    if config.depth.is_settled:
+        depth_step.keep()
     return make_policy_processor_pipelines(
         [
             steps.rename_observations,
-            DepthToCloudProcessorStep(recipe=config.depth.recipe),
+            depth_step,
             PointCloudProcessorStep(config.n_points, config.colour),
             *_own_steps(config, stats[OBS_STATE]),
             steps.add_batch_dim,
@@ -97,7 +100,10 @@ def load_processors(
         if isinstance(step, DepthToCloudProcessorStep):
             # A further training's, where that has another one; depth images show the robot.
             step.recipe = None if config.observation == OBJECT_CLOUD else config.depth.recipe or step.recipe
-            step.install(config.depth.calibration)
+            if config.depth.is_settled:
+                step.keep()
+            else:
+                step.install(config.depth.calibration)
     _check_pipelines(config, checkpoint, *processors)
     return processors
 

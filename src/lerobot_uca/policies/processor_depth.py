@@ -4,6 +4,7 @@ Letters: B samples, O observation steps, H, W height and width of an image, N po
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, override
 
@@ -52,10 +53,21 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
         Raises:
             UserError: if a camera is not calibrated, or if something cannot be right.
         """
+        self._use(lambda trained: _installed(trained, folder))
+
+    def keep(self) -> None:
+        """Let the cameras be where the recipe says: what comes is the data of its training.
+
+        Raises:
+            UserError: as `install`.
+        """
+        self._use(lambda trained: trained)
+
+    def _use(self, present: Callable[[CloudRecipe], CloudRecipe]) -> None:
         if self.recipe is None:
             return
         try:
-            self._present = _installed(CloudRecipe.from_dict(self.recipe), folder)
+            self._present = present(CloudRecipe.from_dict(self.recipe))
             self._make = self._present.make()
         except CalibrationError as error:
             raise UserError(str(error)) from error

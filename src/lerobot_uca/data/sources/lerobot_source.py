@@ -8,13 +8,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.data.recorded_calibrations import EXTRINSICS, INTRINSICS, recorded_calibrations
+from lerobot_uca.data.recorded_calibrations import recorded_calibrations
 from lerobot_uca.data.sources.source import ACTION, STATE, Frame, Source
 from lerobot_uca.errors import UserError, reported
-from lerobot_uca.features import POINT_CLOUD, VALID_MASK_SUFFIX, cloud_observation, find_point_cloud
+from lerobot_uca.features import (
+    EXTRINSICS,
+    INTRINSICS,
+    POINT_CLOUD,
+    VALID_MASK_SUFFIX,
+    cloud_observation,
+    find_point_cloud,
+)
 from lerobot_uca.point_clouds.depth import DepthError, is_valid
 from lerobot_uca.point_clouds.geometry import Crop
-from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe, camera_of, depth_keys, recipe_for
+from lerobot_uca.point_clouds.recipe import (
+    RECIPE_INFO,
+    CloudRecipe,
+    camera_of,
+    depth_keys,
+    installed_calibrations,
+    recipe_for,
+)
 
 
 @dataclass
@@ -98,8 +112,10 @@ class LeRobotSource(Source):
         """
         if self.colour:
             raise UserError("--colour=true needs points with colours: depth images have none.")
-        recorded = {} if folder else recorded_calibrations(self._dataset)
-        self.depth_recipe = recipe_for(self.features, corners, n_points, folder, recorded)
+        calibrations = installed_calibrations(folder) or {}
+        if not folder:
+            calibrations |= recorded_calibrations(self._dataset)
+        self.depth_recipe = recipe_for(self.features, corners, n_points, calibrations)
 
     def seen(self, episode: int, frame: int) -> str:
         """The part of the scene that the crop covers in one step, in a line."""
