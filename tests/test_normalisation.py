@@ -16,6 +16,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
+from lerobot_uca.data import batched_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.deploy.export import RawPolicy, export
 from lerobot_uca.deploy.onnx_runner import OnnxPolicy
@@ -234,8 +235,12 @@ def test_colours_that_are_missing(dataset_root, checkpoint, tmp_path):
         pre(make_observation())
 
 
+@pytest.mark.parametrize("is_batched", [True, False])  # a dataset with a camera, or of more than 4 GiB, is not
 @pytest.mark.parametrize("shape", [(N_POINTS,), (N_POINTS, 1)])
-def test_invalid_points_count_nowhere(tmp_path, shape):
+def test_invalid_points_count_nowhere(tmp_path, shape, is_batched, monkeypatch):
+    if not is_batched:
+        monkeypatch.setattr(batched_dataset, "MAX_BYTES", 0)
+
     def mask(frame, *_):
         frame["observation.pointcloud.valid_mask"][:] = True
         frame["observation.pointcloud.valid_mask"][5:9] = False
@@ -251,7 +256,11 @@ def test_invalid_points_count_nowhere(tmp_path, shape):
     assert policy.select_action(pre(LeRobotDataset("test/random", root=tmp_path / "data")[0])).isfinite().all()
 
 
-def test_a_frame_without_valid_points_is_named(tmp_path):
+@pytest.mark.parametrize("is_batched", [True, False])
+def test_a_frame_without_valid_points_is_named(tmp_path, is_batched, monkeypatch):
+    if not is_batched:
+        monkeypatch.setattr(batched_dataset, "MAX_BYTES", 0)
+
     def mask(frame, episode, index):
         frame["observation.pointcloud.valid_mask"][:] = (episode, index) != (1, 2)
 

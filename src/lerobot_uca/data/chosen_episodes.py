@@ -3,13 +3,13 @@
 `masks` are the features to look at and, for each, the feature that says which of its points are valid, if there is one.
 """
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow.dataset
 import torch
-from lerobot.datasets.compute_stats import aggregate_feature_stats
+from lerobot.datasets.compute_stats import RunningQuantileStats, aggregate_feature_stats
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -18,7 +18,8 @@ from lerobot_uca.errors import UserError
 
 MAX_LISTED = 30
 """Episodes that an error message lists."""
-QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+CHUNK = 1024
+"""Rows that are looked at together."""
 
 Masks = Mapping[str, str | None]
 Statistics = dict[str, dict[str, NDArray[Any]]]
@@ -34,48 +35,78 @@ def chosen_statistics(dataset: Any, masks: Masks) -> Statistics:
         of_episodes = _episode_statistics(dataset, masks).values()
         grouped = {key: [each[key] for each in of_episodes if key in each] for key in masks}
         stats = {key: aggregate_feature_stats(each) for key, each in grouped.items() if each}
-    columns = _columns(dataset)
     for key, mask in masks.items():
-        if mask is not None and columns is not None and key in stats:
-            valid = columns.tensors[mask].flatten(1).bool()
-            stats = {**stats, key: _point_statistics(columns.tensors[key][valid].numpy())}
+        if mask is not None and key in stats:
+            running = RunningQuantileStats()
+            for rows in _rows(dataset, key, mask):
+                running.update(rows.values[rows.valid].double().numpy())
+            stats = {**stats, key: running.get_statistics()}
     return {key: stats[key] for key in masks if key in stats}
 
 
 def check_finite(dataset: Any, masks: Masks) -> None:
     """Raise a `UserError` that names episode and frame if a value of the chosen episodes is NaN or infinite.
 
-    A cloud without valid points is refused, too, if the dataset is read in batches. Otherwise the statistics are
-    checked, and rows only to name the frame.
+    A cloud without valid points is refused, too. A feature without a mask of a dataset that is not read in batches is
+    checked by its statistics, and its rows only to name the frame.
     """
-    columns = _columns(dataset)
-    if columns is None:
-        for episode, stats in _episode_statistics(dataset, masks).items():
-            for key, of_key in stats.items():
-                if not all(np.isfinite(each).all() for each in of_key.values()):
-                    frame = _first_bad_frame(dataset, key, episode)
-                    place = "or its statistics" if frame is None else f"frame {frame}"
-                    raise UserError(
-                        f"'{key}' must be finite, got NaN or infinite values in episode {episode}, {place}. "
-                        + _without([episode], dataset)
-                    )
-        return
     for key, mask in masks.items():
-        values = columns.tensors[key]
-        valid = torch.ones(len(values), 1) if mask is None else columns.tensors[mask].flatten(1)
-        empty = (~valid.bool().any(dim=1)).nonzero().flatten()
-        if len(empty):
+        if mask is None and _columns(dataset) is None:
+            _check_statistics(dataset, key)
+        else:
+            _check_rows(dataset, key, mask)
+
+
+class _Rows(NamedTuple):
+    """R rows of a feature."""
+
+    values: Tensor  # (R, ...)
+    valid: Tensor  # (R, N) bool, or (R, 1) if all counts
+    places: list[tuple[int, int]]  # episode and frame
+
+
+def _rows(dataset: Any, key: str, mask: str | None) -> Iterator[_Rows]:
+    columns = _columns(dataset)
+    names = [key, *([mask] if mask else []), "episode_index", "frame_index"]
+    if columns is not None:
+        chunks = zip(*(columns.tensors[name].split(CHUNK) for name in names), strict=True)
+        batches: Iterable[dict[str, Any]] = (dict(zip(names, each, strict=True)) for each in chunks)
+    else:
+        batches = dataset.hf_dataset.select_columns(names).with_format("numpy").iter(batch_size=CHUNK)
+    for batch in batches:
+        values = torch.as_tensor(np.asarray(batch[key]))
+        valid = torch.as_tensor(np.asarray(batch[mask])) if mask else torch.ones(len(values), 1)
+        episodes, frames = (np.asarray(batch[name]).tolist() for name in names[-2:])
+        yield _Rows(values, valid.flatten(1).bool(), list(zip(episodes, frames, strict=True)))
+
+
+def _check_rows(dataset: Any, key: str, mask: str | None) -> None:
+    empty: list[tuple[int, int]] = []
+    bad: list[tuple[int, int]] = []
+    n_bad = 0  # values of the first of these rows
+    for rows in _rows(dataset, key, mask):
+        is_bad = _bad(rows.values, rows.valid)
+        empty += [rows.places[row] for row in (~rows.valid.any(dim=1)).nonzero().flatten().tolist()]
+        found = is_bad.any(dim=1).nonzero().flatten().tolist()
+        n_bad = n_bad if bad or not found else int(is_bad[found[0]].sum())
+        bad += [rows.places[row] for row in found]
+    if empty:
+        raise UserError(f"'{mask}' must call some points of '{key}' valid, got none in {_place(empty, dataset)}")
+    if bad:
+        n_values = int(np.prod(rows.values.shape[1:]))
+        raise UserError(
+            f"'{key}' must be finite, got {n_bad} of {n_values} values NaN or infinite in {_place(bad, dataset)}"
+        )
+
+
+def _check_statistics(dataset: Any, key: str) -> None:
+    for episode, stats in _episode_statistics(dataset, {key: None}).items():
+        if not all(np.isfinite(each).all() for of_key in stats.values() for each in of_key.values()):
+            frame = _first_bad_frame(dataset, key, episode)
+            place = "or its statistics" if frame is None else f"frame {frame}"
             raise UserError(
-                f"'{mask}' must call some points of '{key}' valid, got none in " + _place(columns, empty, dataset)
-            )
-        chunks = zip(values.split(1024), valid.split(1024), strict=True)
-        rows = torch.cat([_bad(*chunk).any(dim=1) for chunk in chunks]).nonzero().flatten()
-        if len(rows):
-            first = int(rows[0])
-            bad = _bad(values[first : first + 1], valid[first : first + 1])
-            raise UserError(
-                f"'{key}' must be finite, got {int(bad.sum())} of {bad.numel()} values NaN or infinite in "
-                + _place(columns, rows, dataset)
+                f"'{key}' must be finite, got NaN or infinite values in episode {episode}, {place}. "
+                + _without([episode], dataset)
             )
 
 
@@ -89,14 +120,13 @@ def _first_bad_frame(dataset: Any, key: str, episode: int) -> int | None:
 def _bad(values: Tensor, valid: Tensor) -> Tensor:
     """Rows (R, ...) of values, and which of their points are valid (R, N) or (R, 1), to what is bad, (R, values)."""
     bad = ~torch.isfinite(values).reshape(len(values), valid.shape[1], -1)
-    return (bad & valid.bool()[..., None]).flatten(1)
+    return (bad & valid[..., None]).flatten(1)
 
 
-def _place(columns: Columns, rows: Tensor, dataset: Any) -> str:
-    episodes = columns.tensors["episode_index"][rows].unique().tolist()
-    frame, episode = (int(columns.tensors[f"{name}_index"][rows[0]]) for name in ("frame", "episode"))
-    more = f" and in {len(rows) - 1} more frames, of the episodes {episodes[:MAX_LISTED]}" if len(rows) > 1 else ""
-    return f"episode {episode}, frame {frame}{more}. {_without(episodes, dataset)}"
+def _place(places: list[tuple[int, int]], dataset: Any) -> str:
+    episodes = sorted({episode for episode, _ in places})
+    more = f" and in {len(places) - 1} more frames, of the episodes {episodes[:MAX_LISTED]}" if len(places) > 1 else ""
+    return f"episode {places[0][0]}, frame {places[0][1]}{more}. {_without(episodes, dataset)}"
 
 
 def _without(episodes: list[int], dataset: Any) -> str:
@@ -125,11 +155,3 @@ def _episode_statistics(dataset: Any, masks: Masks) -> dict[int, Statistics]:
                 if row[name] is not None:
                     stats.setdefault(key, {})[statistic] = np.asarray(row[name]).reshape(-1)
     return result
-
-
-def _point_statistics(points: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Statistics of points (P, C), per channel, under LeRobot's names."""
-    points = points.astype(np.float64)
-    stats = {name: getattr(np, name)(points, axis=0) for name in ("min", "max", "mean", "std")}
-    quantiles = zip(QUANTILES, np.quantile(points, QUANTILES, axis=0), strict=True)
-    return {**stats, **{f"q{quantile * 100:02.0f}": values for quantile, values in quantiles}}
