@@ -133,6 +133,11 @@ def signals_put_off() -> Iterator[None]:
             signal.raise_signal(number)
 
 
+def n_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
 def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of worker processes. When it is left, what they are doing is finished, and what waits is dropped.

@@ -1,7 +1,10 @@
 import dataclasses
 import gc
+import os
 import re
 import shutil
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 
@@ -17,6 +20,7 @@ from tests.builders import make_config, make_statistics
 from tests.depth_builders import make_recipe
 
 from lerobot_uca.data import collect as collecting
+from lerobot_uca.data import demonstrations
 from lerobot_uca.data.collect import CollectConfig, collect
 from lerobot_uca.data.convert import ConvertConfig, convert
 from lerobot_uca.data.demonstrations import Demonstration, demonstrate
@@ -291,3 +295,20 @@ def test_wrong_settings(tmp_path):
         collect(config(tmp_path / "new", n_episodes=0))
     with pytest.raises(UserError, match=r"Only point-cloud environments have a demonstrator, got env\.type=pusht"):
         collect(config(tmp_path / "new", env=make_env_config("pusht")))
+
+
+@pytest.mark.parametrize(("cores", "wanted", "workers"), [({0}, 5, 1), ({0, 1, 2, 3}, 2, 2), ({0, 1}, 5, 2)])
+def test_no_more_processes_than_cores_or_episodes(cores, wanted, workers, monkeypatch):
+    """On a machine of many cores a job may have few."""
+
+    @contextmanager
+    def pool(n_workers):
+        assert n_workers == workers
+        with ThreadPoolExecutor(n_workers) as threads:
+            yield threads
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores)
+    monkeypatch.setattr(demonstrations, "worker_pool", pool)
+    one = Demonstration(np.zeros((1, 4, 3)), np.zeros((1, 9)), np.zeros((1, 4)), is_successful=True)
+    monkeypatch.setattr(demonstrations, "demonstrate", lambda *_: one)
+    assert len(list(demonstrations.demonstrations(None, iter(range(9)), n_wanted=wanted))) == wanted

@@ -3,6 +3,8 @@
 import csv
 import json
 import sys
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -21,7 +23,9 @@ from tests.depth_builders import (
 
 from lerobot_uca.data import convert as command
 from lerobot_uca.data.batched_dataset import BatchedDataset
-from lerobot_uca.data.convert import ConvertConfig, convert
+from lerobot_uca.data.convert import ConvertConfig, convert, convert_episode
+from lerobot_uca.data.sources.lerobot_source import LOST_RECIPE
+from lerobot_uca.data.sources.source import Frame
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, RECIPE_INFO, CloudRecipe
@@ -484,6 +488,57 @@ def test_clouds_converted_again_are_as_many_points_on_the_robot(depth_dataset, t
     assert recipe.n_points == dataset.features[OBS_POINT_CLOUD]["shape"][0] == 16
     assert (dataset.fps, dataset[0]["task"]) == (20, "push")
     assert "--fps and --task are for sources without them; a LeRobot dataset keeps its own." in caplog.messages
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_clouds_cropped_again_are_not_what_a_robot_makes(depth_dataset, tmp_path, caplog):
+    convert(config(depth_dataset.root, tmp_path / "clouds"))
+    wide = {"crop_low": tuple(x - 1 for x in CROP.low), "crop_high": tuple(x + 1 for x in CROP.high)}
+    for root, crop, has_recipe in (("wide", wide, True), ("tight", {"crop_low": (0.3, *CROP.low[1:])}, False)):
+        caplog.clear()
+        dataset = convert(config(tmp_path / "clouds", tmp_path / root, **crop))
+        assert (RECIPE_INFO in dataset.features[OBS_POINT_CLOUD]["info"]) == has_recipe
+        assert (f"Not kept: {LOST_RECIPE}." in caplog.messages) != has_recipe
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_clouds_beside_the_depth_are_not_kept(tmp_path, caplog):
+    clouds = {OBS_POINT_CLOUD: lambda index: np.zeros((8, 3), np.float32)}
+    source = write_depth_dataset(tmp_path / "data", video=False, columns=clouds)
+    convert(config(source.root, tmp_path / "clouds"))
+    assert f"Not kept: {OBS_POINT_CLOUD}." in caplog.messages
+
+
+@pytest.mark.parametrize("root", ["data/raw", "data"])
+@pytest.mark.usefixtures("calibrated")
+def test_a_source_is_not_replaced(tmp_path, root):
+    source = write_depth_dataset(tmp_path / "data" / "raw", video=False)
+    with pytest.raises(UserError, match=r"would replace the source, '.*data/raw': name another folder"):
+        convert(config(source.root, tmp_path / root, overwrite=True))
+    assert LeRobotDataset("test/depth", root=source.root).num_episodes == 2
+
+
+def test_no_more_is_held_than_needed():
+    """Of an episode the sampled clouds, of a dataset as many episodes as are written and converted meanwhile."""
+    alive: list[weakref.ref] = []
+
+    class Recording:
+        def frames(self, episode):
+            for _ in range(5):
+                assert sum(each() is not None for each in alive) <= 1  # the one before, in the caller's hands
+                points = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+                alive.append(weakref.ref(points))
+                frame = Frame(points, 1000, 0.0, np.zeros(2, np.float32), np.zeros(2, np.float32), "a")
+                del points
+                yield frame
+                del frame
+
+    assert convert_episode(Recording(), 16, 0).clouds.shape == (5, 16, 3)
+    begun = []
+    with ThreadPoolExecutor(1) as pool:
+        for n_taken, _ in enumerate(command._in_order(pool, begun.append, range(20), n_ahead=2)):
+            assert len(begun) <= n_taken + 1 + 2
+    assert begun == list(range(20))
 
 
 @pytest.mark.usefixtures("calibrated")

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.point_clouds.calibration import pose_difference, read_calibrations
+from lerobot_uca.point_clouds.calibration import CalibrationError, pose_difference, read_calibrations
 from lerobot_uca.robots import calibrate as command
 from lerobot_uca.robots.calibrate import BoardConfig, CalibrateConfig, calibrate
 
@@ -135,6 +135,27 @@ def test_the_command_writes_a_file_and_tells_what_changed(tmp_path, monkeypatch,
     assert "deg from here (20" in capsys.readouterr().out
 
 
+def test_a_camera_that_is_replaced(tmp_path, monkeypatch, caplog):
+    """Its name stands for the new device, and the old one's file stays to be looked at."""
+    folder, points = tmp_path / "cameras", write_points(tmp_path / "touched.csv", pixels=False)
+    options = ["--intrinsics=[640,480,605,604,321,243]", f"--folder={folder}"]
+    for camera, serial in (("front", "111"), ("side", "333"), ("front", "222")):
+        run(monkeypatch, f"--camera={camera}", f"--serial={serial}", *options, f"--points={points}")
+    assert {name: each.serial for name, each in read_calibrations(folder).items()} == {"front": "222", "side": "333"}
+    assert sorted(file.name for file in folder.iterdir()) == ["111.yaml.old", "222.yaml", "333.yaml"]
+    assert "Camera 'front' was the device 111: its file is" in caplog.text
+    (folder / "111.yaml.old").rename(folder / "111.yaml")
+    with pytest.raises(CalibrationError, match=r"one calibration of camera 'front', got 111\.yaml and 222\.yaml"):
+        read_calibrations(folder)
+
+
+def test_a_spreadsheets_csv(tmp_path):
+    points = write_points(tmp_path / "touched.csv", pixels=False)
+    expected = calibrate(settings(points=points))[0]
+    points.write_text(points.read_text(), encoding="utf-8-sig")
+    assert calibrate(settings(points=points))[0] == expected
+
+
 def bad_inputs(tmp_path):
     points = tmp_path / "touched.csv"
     write_points(points, pixels=False)
@@ -148,7 +169,16 @@ def bad_inputs(tmp_path):
     no_picture = tmp_path / "no_picture"
     no_picture.mkdir()
     write_csv(no_picture / "poses.csv", ("image", *command.POSE), [["a.png", 0, 0, 0, 0, 0, 0]])
+    no_image, nan = tmp_path / "no_image", tmp_path / "nan.csv"
+    no_image.mkdir()
+    write_csv(no_image / "poses.csv", command.POSE, [[0, 0, 0, 0, 0, 0]])
+    nan.write_text("base_x,base_y,base_z,camera_x,camera_y,camera_z\n1,2,3,4,5,6\n1,2,nan,4,5,6\n")
     return {
+        "must have the column image, the names of the pictures, got x, y, z": settings(board_folder=no_image),
+        r"must hold finite numbers in base_x, base_y, base_z, got \[ 1.  2. nan\] in row 2": settings(points=nan),
+        "must be one of OpenCV's, such as DICT_4X4_50, got 'CharucoBoard'": settings(
+            board_folder=no_picture, board=dataclasses.replace(BOARD, dictionary="CharucoBoard")
+        ),
         "Give either --points": settings(),
         "for one on the arm use --board_folder": settings(points=points, on_arm=True),
         "At least 4 pairs of points are needed, got 3": settings(points=few),

@@ -135,7 +135,12 @@ def test_the_crop_is_written_into_a_training_configuration(tmp_path):
         "policy": {"depth": {"crop_low": list(CROP.low), "crop_high": list(CROP.high)}},
         "batch_size": 64,
     }
-    file.write_text("- 1")
+    commented = "batch_size: 64 # as in the paper\n"
+    file.write_text(commented)
+    assert write_crop(file, CROP) == tmp_path / "mine.yaml.old"
+    assert write_crop(file, CROP) is None
+    assert (tmp_path / "mine.yaml.old").read_text() == commented
+    assert yaml.safe_load(file.read_text())["batch_size"] == 64
     for text, message in {
         "- 1": "mine.yaml' must hold options of a training by name, got list",
         "policy: uca_flow": "policy in .*mine.yaml' must hold options of a training by name, got str",

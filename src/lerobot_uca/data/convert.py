@@ -6,9 +6,12 @@ Example:
 
 import importlib.metadata
 import logging
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -116,6 +119,8 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
         raise UserError(f"'{config.source}' does not say how many steps a second it has: give --fps.")
     episodes = _chosen(config.episodes, source.n_episodes)
     root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
+    if config.source.resolve().is_relative_to(root.resolve()):
+        raise UserError(f"--root '{root}' would replace the source, '{config.source}': name another folder.")
     with whole_folder(root, overwrite=config.overwrite) as unfinished:
         _write(config, source, fps, episodes, unfinished)
     if left_out := source.left_out():
@@ -140,13 +145,13 @@ def make_source(config: ConvertConfig) -> Source:
 
 def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
     """Read and sample one episode."""
-    frames = source.frames(episode)
+    frames = [frame._replace(points=_sample(frame.points, n_points)) for frame in source.frames(episode)]
     if len(frames) < 2:  # of one frame LeRobot's statistics of a cloud have another shape
         raise UserError(
             f"Episode {episode} must have at least 2 frames, got {len(frames)}: leave it out by --episodes."
         )
     few = [index for index, frame in enumerate(frames) if frame.n_points < least_points(n_points)]
-    clouds = [_sample(frame.points, n_points) for frame in frames]
+    clouds = [frame.points for frame in frames]
     state, action = (np.stack([getattr(frame, name) for frame in frames]) for name in ("state", "action"))
     report = EpisodeReport(
         episode,
@@ -225,7 +230,18 @@ def _converted(config: ConvertConfig, source: Source, episodes: list[int]) -> It
         yield from bar(map(convert_one, episodes))
         return
     with worker_pool(config.num_workers) as pool:
-        yield from bar(pool.map(convert_one, episodes))
+        yield from bar(_in_order(pool, convert_one, episodes, n_ahead=2 * config.num_workers))
+
+
+def _in_order(
+    pool: Executor, convert_one: Callable[[int], Episode], episodes: Iterable[int], n_ahead: int
+) -> Iterator[Episode]:
+    """The converted episodes; no more of them at once than this, as writing may take longer than converting."""
+    left = iter(episodes)
+    pending = deque(pool.submit(convert_one, episode) for episode in islice(left, n_ahead))
+    while pending:
+        yield pending.popleft().result()
+        pending.extend(pool.submit(convert_one, episode) for episode in islice(left, 1))
 
 
 def _add(dataset: LeRobotDataset, episode: Episode) -> None:

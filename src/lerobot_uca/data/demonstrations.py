@@ -1,6 +1,5 @@
-"""Running experts, on all cores. Light to import, without torch and LeRobot: each worker process does it."""
+"""Running experts, one a core. Light to import, without torch and LeRobot: each worker process does it."""
 
-import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from lerobot_uca.envs.experts.expert import Attempt
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
-from lerobot_uca.processes import worker_pool
+from lerobot_uca.processes import n_cores, worker_pool
 
 
 class Demonstration(NamedTuple):
@@ -53,9 +52,9 @@ def demonstrations(
 ) -> Generator[Demonstration]:
     """Episodes of the attempts in order, until n_wanted were successful or the attempts are used up.
 
-    One process a core runs them, each as `demonstrate` does.
+    One process a core that this one may use runs them, each as `demonstrate` does.
     """
-    n_workers = os.cpu_count() or 1
+    n_workers = max(1, min(n_cores(), n_wanted))
     pending: deque[Future[Demonstration]] = deque()
     n_missing = n_wanted
     with worker_pool(n_workers) as pool:

@@ -136,6 +136,7 @@ def read_calibrations(folder: Path) -> dict[str, Calibration]:
     if not files:
         raise CalibrationError(f"'{folder}' must be a folder of calibrations (*.yaml), made by lerobot-uca-calibrate.")
     found: dict[str, Calibration] = {}
+    file_of: dict[str, Path] = {}
     for file in files:
         try:
             values = yaml.safe_load(file.read_text(encoding="utf-8"))
@@ -148,8 +149,11 @@ def read_calibrations(folder: Path) -> dict[str, Calibration]:
             raise CalibrationError(f"'{file}' must name its camera's serial: another device is not calibrated by it.")
         name = calibration.camera.name
         if name in found:
-            raise CalibrationError(f"'{folder}' must hold one calibration of camera '{name}', got two.")
-        found[name] = calibration
+            raise CalibrationError(
+                f"'{folder}' must hold one calibration of camera '{name}', got {file_of[name].name} and {file.name}: "
+                "move one of them elsewhere."
+            )
+        found[name], file_of[name] = calibration, file
     return found
 
 

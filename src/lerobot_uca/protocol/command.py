@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.processes import n_cores
 from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid, resolve_policies, resolve_tasks
-from lerobot_uca.protocol.launchers import Launcher, local, n_cores, on_ray, on_slurm
+from lerobot_uca.protocol.launchers import Launcher, local, on_ray, on_slurm
 from lerobot_uca.protocol.report import report
 from lerobot_uca.protocol.run import make_folder, run
 

@@ -18,9 +18,8 @@ from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt, pushed, smoothed
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
-from lerobot_uca.processes import worker_pool
+from lerobot_uca.processes import n_cores, worker_pool
 from lerobot_uca.protocol.cells import Cell
-from lerobot_uca.protocol.launchers import n_cores
 from lerobot_uca.whole_file import whole_file
 
 

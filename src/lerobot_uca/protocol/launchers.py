@@ -157,8 +157,3 @@ def on_slurm(options: Mapping[str, str], cluster: str = "slurm") -> Launcher:
             time.sleep(POLL_SECONDS)
 
     return launch
-
-
-def n_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

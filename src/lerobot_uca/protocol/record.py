@@ -1,11 +1,12 @@
 """The origin of a result: versions, commit, hardware."""
 
 import importlib.metadata
-import os
 import platform
 import subprocess
 from pathlib import Path
 from typing import Any
+
+from lerobot_uca.processes import n_cores
 
 PACKAGES = (
     *("lerobot", "lerobot_policy_uca_flow", "torch", "openvino", "onnxruntime"),
@@ -24,7 +25,7 @@ def provenance() -> dict[str, Any]:
         "commit": commit(),
         "hardware": {
             "cpu": _cpu(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "cores": n_cores(),
             "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
             "threads": torch.get_num_threads(),
         },

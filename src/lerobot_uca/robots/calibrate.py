@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from lerobot.configs import parser
 from tqdm import tqdm
 
@@ -54,7 +55,8 @@ class CalibrateConfig:
       lerobot-uca-calibrate --points=touched.csv --camera=front --serial=123456 --intrinsics='[640,480,605,605,321,243]'
 
     From a ChArUco board in several poses of the robot: a folder with pictures and a poses.csv with the columns
-    image, x, y, z [m], rx, ry, rz [rad, rotation vector], the tool's pose in the base frame, as a UR shows it:
+    image, x, y, z [m], rx, ry, rz [rad, rotation vector], the tool's pose in the base frame, as a UR shows it. The
+    pictures are of the imager whose frame depth has, on a RealSense D400 the left infrared one with its emitter off:
 
       lerobot-uca-calibrate --board_folder=board --camera=front --serial=123456 --intrinsics='[640,480,605,605,321,243]'
 
@@ -134,7 +136,9 @@ def see_board(folder: Path, board: BoardConfig, camera: Camera) -> tuple[Array, 
     file = folder / "poses.csv"
     rows = _read_csv(file)
     poses = _columns(file, rows, POSE)
-    if not hasattr(cv2.aruco, board.dictionary):
+    if "image" not in rows[0]:
+        raise UserError(f"'{file}' must have the column image, the names of the pictures, got {', '.join(rows[0])}.")
+    if not (board.dictionary.startswith("DICT_") and hasattr(cv2.aruco, board.dictionary)):
         raise UserError(f"board.dictionary must be one of OpenCV's, such as DICT_4X4_50, got '{board.dictionary}'.")
     if not (0 < board.marker < board.square and min(board.squares) >= MIN_SQUARES):
         raise UserError(
@@ -186,7 +190,7 @@ def _from_vectors(rotation: Array, translation: Array) -> Array:
 
 def _read_csv(file: Path) -> list[dict[str, str]]:
     try:
-        with file.open(newline="", encoding="utf-8") as opened:
+        with file.open(newline="", encoding="utf-8-sig") as opened:  # spreadsheets write a mark at the beginning
             return [{(key or "").strip(): value for key, value in row.items()} for row in csv.DictReader(opened)]
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"'{file}' cannot be read: {error}") from error
@@ -200,9 +204,15 @@ def _columns(file: Path, rows: list[dict[str, str]], names: tuple[str, ...]) -> 
             f"'{file}' must have the columns {', '.join(names)}; {', '.join(missing)} is missing, got {got}."
         )
     try:
-        return np.array([[float(row[name]) for name in names] for row in rows])
+        values = np.array([[float(row[name]) for name in names] for row in rows])
     except (TypeError, ValueError) as error:
         raise UserError(f"'{file}' must hold numbers in {', '.join(names)}: {error}") from error
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise UserError(
+            f"'{file}' must hold finite numbers in {', '.join(names)}, got {values[bad[0]]} in row {bad[0] + 1}."
+        )
+    return values
 
 
 @parser.wrap()
@@ -213,6 +223,8 @@ def run(config: CalibrateConfig) -> None:
     before = _previous(config)
     try:
         file = calibration.write(config.folder)
+        if before is not None and before.serial != config.serial:
+            _set_aside(config.folder, before)
     except OSError as error:
         raise UserError(f"--folder '{config.folder}' cannot be written: {error}") from error
     worst = int(np.argmax(fit.mm))
@@ -223,6 +235,16 @@ def run(config: CalibrateConfig) -> None:
         mm, deg = pose_difference(before.camera.X_world_camera, pose)
         print(f"It was {mm:.1f} mm and {deg:.2f} deg from here ({before.date or 'no date'}).")
     print(f"Written: {file}. Use it: export LEROBOT_UCA_CALIBRATION={config.folder.absolute()}")
+
+
+def _set_aside(folder: Path, replaced: Calibration) -> None:
+    """A camera's name stands for one device: the file of the one before is no calibration any longer."""
+    for file in folder.glob("*.yaml"):
+        if str(yaml.safe_load(file.read_text(encoding="utf-8"))["serial"]) == replaced.serial:
+            aside = file.rename(file.with_name(f"{file.name}.old"))
+            logger.warning(
+                "Camera '%s' was the device %s: its file is %s now.", replaced.camera.name, replaced.serial, aside
+            )
 
 
 def _previous(config: CalibrateConfig) -> Calibration | None:

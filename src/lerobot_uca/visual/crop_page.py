@@ -76,11 +76,12 @@ class CropPage:
     def write(self) -> None:
         """Write the crop to the configuration, and say so, or why not, on the page."""
         try:
-            write_crop(self._config, self.crop)
+            before = write_crop(self._config, self.crop)
         except UserError as error:
             self._status.content = str(error)
         else:
-            self._status.content = f"written to {self._config}"
+            kept = f"; as it was, with its comments, it is {before} now" if before else ""
+            self._status.content = f"written to {self._config}{kept}"
 
 
 def colours_of(points: NDArray[np.float32], crop: Crop) -> NDArray[np.uint8]:
@@ -93,8 +94,11 @@ def colours_of(points: NDArray[np.float32], crop: Crop) -> NDArray[np.uint8]:
     return np.where(crop.contains(points[:, :3])[:, None], inside, OUTSIDE).clip(0, 255).astype(np.uint8)
 
 
-def write_crop(file: Path, crop: Crop) -> None:
-    """Write a crop as policy.depth of a training configuration; what else is in the file is kept.
+def write_crop(file: Path, crop: Crop) -> Path | None:
+    """Write a crop as policy.depth of a training configuration; what else is in the file is kept, but for comments.
+
+    Returns:
+        The file as it was, under another name, if it had comments.
 
     Raises:
         UserError: if the file is not YAML, holds something else or cannot be written.
@@ -102,18 +106,23 @@ def write_crop(file: Path, crop: Crop) -> None:
     if file.suffix not in (".yaml", ".yml"):
         raise UserError(f"The crop is written into a YAML file, such as crop.yaml, got '{file}'.")
     try:
-        settings = yaml.safe_load(file.read_text(encoding="utf-8")) if file.exists() else {}
+        text = file.read_text(encoding="utf-8") if file.exists() else ""
+        settings = yaml.safe_load(text)
     except (OSError, yaml.YAMLError) as error:
         raise UserError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from error
     settings = _options(settings, f"'{file}'")
     policy = settings["policy"] = _options(settings.get("policy"), f"policy in '{file}'")
     depth = policy["depth"] = _options(policy.get("depth"), f"policy.depth in '{file}'")
     depth["crop_low"], depth["crop_high"] = list(crop.low), list(crop.high)
+    before = file.with_name(f"{file.name}.old") if "#" in text else None
     try:
-        with whole_file(file) as unfinished:
-            unfinished.write_text(yaml.safe_dump(settings, sort_keys=False), encoding="utf-8")
+        for target, content in ((before, text), (file, yaml.safe_dump(settings, sort_keys=False))):
+            if target is not None:
+                with whole_file(target) as unfinished:
+                    unfinished.write_text(content, encoding="utf-8")
     except OSError as error:
         raise UserError(f"Cannot write '{file}': {error}") from error
+    return before
 
 
 def _options(values: Any, what: str) -> dict[str, Any]:

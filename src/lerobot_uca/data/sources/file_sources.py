@@ -3,7 +3,7 @@
 import csv
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -69,15 +69,13 @@ class ZarrSource(Source):
         """The number of episodes."""
         return self._group[ZARR_KEYS[3]].shape[0]
 
-    def frames(self, episode: int) -> list[Frame]:
-        """The steps of one episode."""
+    def frames(self, episode: int) -> Iterator[Frame]:
+        """The steps of one episode, which is read as a whole."""
         ends = self._read(self._group, ZARR_KEYS[3])
         steps = slice(int(ends[episode - 1]) if episode else 0, int(ends[episode]))
         columns = [self._read(self._group, key, steps).astype(np.float32) for key in ZARR_KEYS[:3]]
-        return [
-            Frame(*self._cropped(cloud), np.atleast_1d(state), np.atleast_1d(action), self.task)
-            for cloud, state, action in zip(*columns, strict=True)
-        ]
+        for cloud, state, action in zip(*columns, strict=True):
+            yield Frame(*self._cropped(cloud), np.atleast_1d(state), np.atleast_1d(action), self.task)
 
     def _read(self, group: Any, key: str, steps: slice = slice(None)) -> NDArray[Any]:
         try:
@@ -145,9 +143,9 @@ class FolderSource(Source):
         kind = "action" if key == ACTION else "state"
         return [name.removeprefix(f"{kind}_") for name in self._columns(list(self._rows[0]), kind)]
 
-    def frames(self, episode: int) -> list[Frame]:
+    def frames(self, episode: int) -> Iterator[Frame]:
         """The steps of one episode."""
-        return [self._frame(row) for row in self._episodes[episode]]
+        return map(self._frame, self._episodes[episode])
 
     def _frame(self, row: dict[str, str]) -> Frame:
         file = self.path / row["file"]

@@ -1,5 +1,6 @@
 """LeRobot datasets with depth images or clouds."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,9 +16,9 @@ from lerobot_uca.features import (
     EXTRINSICS,
     INTRINSICS,
     POINT_CLOUD,
-    VALID_MASK_SUFFIX,
     cloud_observation,
     find_point_cloud,
+    valid_mask,
 )
 from lerobot_uca.point_clouds.depth import DepthError, is_valid
 from lerobot_uca.point_clouds.geometry import Crop
@@ -29,6 +30,8 @@ from lerobot_uca.point_clouds.recipe import (
     installed_calibrations,
     recipe_for,
 )
+
+LOST_RECIPE = "the recipe of the clouds, by which a policy makes them on a robot (with another crop they are others)"
 
 
 @dataclass
@@ -79,10 +82,11 @@ class LeRobotSource(Source):
     @property
     def recipe(self) -> CloudRecipe | None:
         """The recipe of the depth images, or the one that the dataset's clouds were made with."""
-        if self.depth_recipe is None and self._cloud_key is not None:
-            made_with = (self.features[self._cloud_key].get("info") or {}).get(RECIPE_INFO)
-            return CloudRecipe.from_dict(made_with) if made_with and self.crop is None else None
-        return self.depth_recipe
+        if self.depth_recipe is not None or self._made_with is None:
+            return self.depth_recipe
+        crop, made_with = self.crop, self._made_with
+        corners = np.array([made_with.crop.low, made_with.crop.high])
+        return made_with if crop is None or crop.contains(corners).all() else None
 
     @property
     def observation(self) -> str:
@@ -125,23 +129,33 @@ class LeRobotSource(Source):
         return self._make.seen([item[key].numpy() for key in self.depth_recipe.keys])
 
     def left_out(self) -> list[str]:
-        """Features that are neither cloud, depth, state nor action."""
-        kept = {STATE, ACTION, self._cloud_key, self._rgb_key}
-        if self.depth_recipe is not None:
+        """Features that are neither state, action nor what the new clouds are made of."""
+        kept = {STATE, ACTION}
+        if self.depth_recipe is None:
+            mask_key = valid_mask(self._cloud_key or "", self.features)
+            kept |= {key for key in (self._cloud_key, self._rgb_key, mask_key) if key}
+        else:
             cameras = [camera_of(key) for key in self.depth_recipe.keys]
             kept |= {*self.depth_recipe.keys, *(kind + each for kind in (INTRINSICS, EXTRINSICS) for each in cameras)}
         own = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
-        return [key for key in self.features if key not in kept | own]
+        lost = [LOST_RECIPE] if self.depth_recipe is None and self._made_with and self.recipe is None else []
+        return [key for key in self.features if key not in kept | own] + lost
 
-    def frames(self, episode: int) -> list[Frame]:
+    def frames(self, episode: int) -> Iterator[Frame]:
         """The steps of one episode."""
         row = self._dataset.meta.episodes[episode]
         items = (self._dataset[index] for index in range(row["dataset_from_index"], row["dataset_to_index"]))
-        return [self._frame(item) for item in items]
+        return map(self._frame, items)
 
     @cached_property
     def _cloud_key(self) -> str | None:
         return find_point_cloud(self.features)
+
+    @cached_property
+    def _made_with(self) -> CloudRecipe | None:
+        """The recipe by which the dataset's clouds were made, if they were."""
+        info = self.features[self._cloud_key].get("info") or {} if self._cloud_key else {}
+        return CloudRecipe.from_dict(info[RECIPE_INFO]) if info.get(RECIPE_INFO) else None
 
     @cached_property
     def _rgb_key(self) -> str | None:
@@ -174,5 +188,6 @@ class LeRobotSource(Source):
         cloud = item[self._cloud_key].numpy()
         if self._rgb_key is not None:
             cloud = np.concatenate([cloud, item[self._rgb_key].numpy()], axis=-1)
-        mask = item.get(self._cloud_key.removesuffix(".xyz") + VALID_MASK_SUFFIX)
+        mask_key = valid_mask(self._cloud_key, item)
+        mask = None if mask_key is None else item[mask_key]
         return self._cropped(cloud if mask is None else cloud[mask.numpy().astype(bool)])

@@ -4,7 +4,9 @@ A source is light to send to another process and opens its files there. Letters:
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,12 +49,13 @@ class Source(ABC):
         """The number of episodes."""
 
     @abstractmethod
-    def frames(self, episode: int) -> list[Frame]:
-        """The steps of one episode."""
+    def frames(self, episode: int) -> Iterator[Frame]:
+        """The steps of one episode, each read when it is asked for where the source allows it."""
 
     def seen(self, episode: int, frame: int) -> str:
         """The part of the scene that the crop covers in one step, in a line."""
-        points = replace(self, crop=None).frames(episode)[frame].points[:, :3]  # type: ignore[type-var]
+        uncropped: Source = replace(self, crop=None)  # type: ignore[type-var]
+        points = next(islice(uncropped.frames(episode), frame, None)).points[:, :3]
         if len(points) == 0:
             return "The cloud has no finite point"
         low, high = (np.round(np.percentile(points, share, axis=0), 3).tolist() for share in (1, 99))
