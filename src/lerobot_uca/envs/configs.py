@@ -194,7 +194,7 @@ class MetaworldPointCloudConfig(PointCloudEnvConfig):
         if expert:
             raise UserError(f"Meta-World's experts are built in. Leave --expert out, got '{expert}'.")
         if task in metaworld_experts.EXPERTS:
-            logger.warning("%s is demonstrated by this package's expert; Meta-World's fails more often.", task)
+            logger.warning("%s is demonstrated by this package's expert; Meta-World's does worse.", task)
         return attempts_by_seed(partial(metaworld.ScriptedExpert, task, straight_paths=straight_paths), first_seed)
 
     @override
