@@ -10,6 +10,7 @@ from lerobot_uca.robots.ur5e.kinematics import (
     pose_to_vector,
     rotation_matrix,
     rotation_vector,
+    turned_inside,
 )
 
 rng = np.random.default_rng(0)
@@ -41,6 +42,24 @@ def test_inverse_kinematics_inverts(q):
     assert solution is not None
     np.testing.assert_allclose(flange_pose(solution), flange_pose(q), atol=1e-5)
     assert np.abs(solution - seed).max() < 1  # the seed's branch
+
+
+def test_no_joint_turns_the_long_way_round():
+    """A tool that points down, at any place and turned by any angle, as a first action may be."""
+    for _ in range(100):
+        yaw = rng.uniform(-np.pi, np.pi)
+        goal = pose_from_vector([*rng.uniform([-0.5, -0.3, 0.1], [-0.3, 0.3, 0.3]), np.pi, 0, 0])
+        goal[:3, :3] = rotation_matrix(np.array([0, 0, yaw])) @ goal[:3, :3]
+        solution = inverse_kinematics(goal, HOME)
+        if solution is None:
+            continue
+        assert np.abs(solution - HOME).max() <= np.pi + 1e-9
+        np.testing.assert_allclose(flange_pose(solution), goal, atol=1e-5)
+        low, high = np.full(6, -np.pi), np.full(6, np.pi)
+        inside = turned_inside(solution, low, high)
+        assert ((low <= inside) & (inside <= high)).all()
+        np.testing.assert_allclose(flange_pose(inside), goal, atol=1e-5)
+    np.testing.assert_array_equal(turned_inside(np.full(6, 3.5), [-1] * 6, [1] * 6), np.full(6, 3.5))  # it cannot be
 
 
 def test_a_pose_out_of_reach_has_no_solution():

@@ -1,10 +1,12 @@
 """The driver with the simulated controller: real sockets, the real client in its process."""
 
+import contextlib
 import logging
 import math
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -18,9 +20,10 @@ from lerobot.utils.errors import DeviceNotConnectedError
 from tests.robots.conftest import free_address, wait_until
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.robots.ur5e.channel import ArmStoppedError
+from lerobot_uca.robots.ur5e import rtde_client
+from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Note, State, decode
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
-from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_to_vector
+from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_from_vector, pose_to_vector, rotation_matrix
 from lerobot_uca.robots.ur5e.sim.controller import Controller
 from lerobot_uca.robots.ur5e.sim.gripper import CLOSED_COUNT, OPEN_COUNT
 from lerobot_uca.robots.ur5e.sim.robot import Command, IdealArm, Runtime
@@ -183,6 +186,60 @@ def test_a_driver_that_stops_on_the_way_to_the_first_action_stops_the_arm(contro
     driver.wait(10)
 
 
+STREAMING = """
+import sys, time
+from pathlib import Path
+from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
+from lerobot_uca.robots.ur5e.ur5e_follower import UR5eFollower
+config = UR5eFollowerConfig(ip=sys.argv[1], gripper="none", stop_after=0.5, calibration_dir=Path(sys.argv[2]))
+with UR5eFollower(config) as robot:
+    start = robot.get_observation()
+    robot.send_action(start)
+    while True:
+        robot.send_action({**start, "shoulder_pan.pos": 6.0})
+        time.sleep(1 / 30)
+"""
+
+
+def test_a_driver_that_goes_on_after_a_suspension_eases_in(controller, tmp_path):
+    """What it reads first is seconds old, from when the arm still moved."""
+    driver = subprocess.Popen(
+        [sys.executable, "-c", STREAMING, controller.address, str(tmp_path)], stderr=subprocess.DEVNULL
+    )
+    try:
+        wait_until(lambda: speed(controller) > 0.5)
+        driver.send_signal(signal.SIGSTOP)
+        wait_until(lambda: stands_still(controller))
+        time.sleep(2.5)  # longer than the watchdog and the heartbeat wait, and the channel is full
+        assert controller.robot.runtime == Runtime.PLAYING
+        setpoints = keep_setpoints(controller)
+        driver.send_signal(signal.SIGCONT)
+        wait_until(lambda: len(setpoints) > 125)
+        assert np.abs(np.diff(setpoints, axis=0)).max() * 125 < 0.25 * 1.05
+        assert setpoints[-1][0] > setpoints[0][0]
+    finally:
+        driver.kill()
+        driver.wait(10)
+
+
+def test_a_note_waits_for_a_driver_that_does_not_read():
+    """And the servo loop does not wait for it."""
+    ours, theirs = socket.socketpair()
+    channel = rtde_client.Channel(theirs.detach())
+    state = State(0.0, 0.0, *[(0.0,) * 6] * 4, is_servoing=False, has_arrived=True)
+    for _ in range(10_000):
+        channel.send(state)
+    began = time.monotonic()
+    channel.send(Note("The arm has stopped."))
+    channel.send(state)
+    assert time.monotonic() - began < 0.5
+    ours.settimeout(1)
+    for line in ours.makefile("rb"):
+        if isinstance(decode(line), Note):
+            break
+        channel.send(state)
+
+
 class HeldArm(IdealArm):
     """An arm that leans on something."""
 
@@ -217,18 +274,53 @@ def test_joint_range_holds(controller, tmp_path):
         np.testing.assert_allclose([commanded[key] for key in JOINT_KEYS], upper)
 
 
-def test_tcp_actions_move_the_tool_in_the_base_frame(controller, tmp_path):
-    robot = make_robot(controller, tmp_path, action="tcp", gripper="none")
-    with robot:
+@pytest.mark.parametrize("tool_length", [0.0, 0.2])
+def test_tcp_actions_move_the_tool_in_the_base_frame(tool_length, tmp_path):
+    with (
+        Controller(address=free_address(), tool_length=tool_length) as controller,
+        make_robot(controller, tmp_path, action="tcp", gripper="none") as robot,
+    ):
         start = robot.get_observation()
-        np.testing.assert_allclose(list(start.values()), pose_to_vector(flange_pose(HOME)), atol=1e-6)
-        target = {**start, "tcp_z.pos": start["tcp_z.pos"] - 0.03}
+        tool = np.eye(4)
+        tool[2, 3] = tool_length
+        np.testing.assert_allclose(pose_from_vector(list(start.values())), flange_pose(HOME) @ tool, atol=1e-6)
+        tilted = pose_from_vector(list(start.values()))
+        tilted[:3, :3] = tilted[:3, :3] @ rotation_matrix(np.array([0.1, 0.05, 0.2]))
+        tilted[2, 3] -= 0.03
+        target = dict(zip(start, pose_to_vector(tilted, near=list(start.values())), strict=True))
         commanded = robot.send_action(target)
         np.testing.assert_allclose(list(commanded.values()), list(target.values()), atol=1e-4)
-        wait_until(lambda: abs(robot.get_observation()["tcp_z.pos"] - target["tcp_z.pos"]) < 1e-3)
-        np.testing.assert_allclose(list(robot.get_observation().values()), list(target.values()), atol=2e-3)
-        held = robot.send_action({**target, "tcp_x.pos": 3.0})  # out of reach
+        wait_until(lambda: np.allclose(list(robot.get_observation().values()), list(target.values()), atol=1e-3))
+        held = robot.send_action({**target, "tcp_x.pos": 1.5})  # out of reach
         np.testing.assert_allclose(list(held.values()), list(commanded.values()), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tcp_rx.pos": 127.2}, r"in radians, no longer than 2 pi, got 127.\d. Degrees?"),
+        ({"tcp_x.pos": -400.0}, r"in metres, within 2 of the base, got 400.\d. Millimetres?"),
+    ],
+)
+def test_tcp_actions_in_other_units_are_refused(controller, tmp_path, change, message):
+    with make_robot(controller, tmp_path, action="tcp", gripper="none") as robot:
+        start = robot.get_observation()
+        with pytest.raises(ArmStoppedError, match=message):
+            robot.send_action({**start, **change})
+        np.testing.assert_allclose(controller.robot.arm.q, HOME)
+
+
+def test_a_tool_that_points_down_is_written_alike_in_each_connection(tmp_path):
+    """The controller's own vector changes its sign where the angle passes pi."""
+    written = []
+    for tilt in (-0.003, 0.003):
+        arm = IdealArm((*HOME[:3], HOME[3] + tilt, *HOME[4:]))
+        with (
+            Controller(arm, address=free_address()) as controller,
+            make_robot(controller, tmp_path, action="tcp", gripper="none") as robot,
+        ):
+            written.append(list(robot.get_observation().values()))
+    np.testing.assert_allclose(written[0], written[1], atol=0.02)
 
 
 def test_without_actions_the_arm_holds_then_stops_and_eases_in_again(controller, tmp_path, caplog):
@@ -283,6 +375,23 @@ def test_a_paused_program_is_ended_and_does_not_go_on_by_itself(controller, robo
         controller.robot.leave_guarded_area()
     with make_robot(controller, tmp_path):
         np.testing.assert_array_equal(controller.robot.arm.q, stood)
+
+
+def test_a_program_that_is_paused_after_its_stop_was_told_is_ended_too(controller, robot):
+    errors = keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+
+    def pause():
+        with controller.robot.lock:
+            if controller.robot.runtime == Runtime.PLAYING:
+                controller.robot.runtime = Runtime.PAUSED
+
+    with controller.robot.lock:
+        controller.robot.safeguard_stop()
+        controller.robot.runtime = Runtime.PLAYING
+    threading.Timer(0.03, pause).start()
+    wait_until(lambda: errors)
+    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
 
 
 def test_a_program_that_somebody_paused_is_refused(controller, tmp_path):
@@ -395,6 +504,9 @@ BAD_ACTIONS = {
     "nan": ({JOINT_KEYS[1]: math.nan}, "finite numbers, got others for shoulder_lift.pos"),
     "infinite": ({GRIPPER_KEY: math.inf}, "got others for gripper.pos"),
     "degrees": ({JOINT_KEYS[0]: 90.0}, "radians.*got 90.0. Degrees?"),
+    "percent": ({GRIPPER_KEY: 5.0}, r"in 0 .open. to 1 .closed., got 5. Another scale?"),
+    "nothing": ({JOINT_KEYS[0]: None}, "values are numbers, one for each name"),
+    "two numbers": ({JOINT_KEYS[0]: np.zeros(2)}, "values are numbers, one for each name"),
     "another robot": ({"elbow_flex.pos": 0.0}, "unknown: elbow_flex.pos"),
 }
 
@@ -430,6 +542,7 @@ BAD_SETTINGS = {
     "nan": ({"max_step": math.nan}, "max_step lies in"),
     "five joints": ({"lower": (0.0,) * 5}, "six angles"),
     "degrees": ({"upper": (180.0,) * 6}, "six angles"),
+    "a rotation of nothing": ({"tool_rotation": (0.0,) * 3}, "tool_rotation holds a rotation vector"),
     "reversed": ({"lower": (0.5,) * 6, "upper": (0.1,) * 6}, "lies below"),
 }
 
@@ -493,10 +606,49 @@ def test_a_gripper_that_is_lost_stops_the_arm(controller, robot):
     errors = keep_moving(robot)
     wait_until(lambda: speed(controller) > 0.1)
     controller.gripper.get = lambda name: "?"
-    with pytest.raises(ArmStoppedError, match=r"gripper no longer answers \(The gripper has no value for POS"):
+    with pytest.raises(ArmStoppedError, match=r"The gripper has no value for (POS|FLT)"):
         wait_until(lambda: robot.get_observation() is None)
     wait_until(lambda: stands_still(controller))
     wait_until(lambda: errors)
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "message"), [("FLT", 14, "reports fault 14"), ("STA", 0, "not active any")]
+)
+def test_a_gripper_that_drops_out_stops_the_arm(controller, robot, register, value, message):
+    errors = keep_moving(robot)
+    wait_until(lambda: speed(controller) > 0.1)
+    registers = controller.gripper.get
+    controller.gripper.get = lambda name: value if name == register else registers(name)
+    with pytest.raises(ArmStoppedError, match=message):
+        wait_until(lambda: robot.get_observation() is None)
+    wait_until(lambda: stands_still(controller))
+    wait_until(lambda: errors)
+
+
+def test_a_gripper_position_that_is_clipped_is_said(controller, robot, caplog):
+    assert robot.send_action(action_at(HOME, gripper=1.2))[GRIPPER_KEY] == 1
+    assert "The gripper's position 1.20 was clipped to 0 (open) to 1 (closed)." in caplog.messages
+
+
+@pytest.mark.parametrize(("port", "line"), [(29999, "dashboard server of .* hung up"), (63352, "URCap at .* hung up")])
+def test_a_connection_that_is_reset_is_one_line(tmp_path, port, line):
+    """As a controller does that is starting."""
+    address = free_address()
+
+    def hang_up(server):
+        connection, _ = server.accept()
+        time.sleep(0.2)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.close()
+
+    with contextlib.ExitStack() as stack:
+        if port != 29999:
+            stack.enter_context(Controller(address=address))
+        server = stack.enter_context(socket.create_server((address, port)))
+        threading.Thread(target=hang_up, args=[server], daemon=True).start()
+        with pytest.raises(UserError, match=line):
+            UR5eFollower(UR5eFollowerConfig(ip=address, calibration_dir=tmp_path)).connect()
 
 
 def test_a_gripper_with_a_fault_is_refused(controller, tmp_path):

@@ -42,6 +42,7 @@ class Stop:
 class State:
     """A message from the arm with every tick of the servo loop: the heartbeat."""
 
+    made_at: float  # [s], of time.monotonic(), which processes share: it may be read much later
     timestamp: float  # [s], the controller's
     q: tuple[float, ...]  # (6,) [rad], measured
     qd: tuple[float, ...]  # (6,) [rad/s], measured

@@ -26,6 +26,10 @@ class UR5eFollowerConfig(RobotConfig):
         ip: the controller's address.
         action: what actions and states are. `joints`: six angles [rad]; `tcp`: the tool centre point's pose in the
             controller's base frame, position [m] and rotation vector [rad]. The gripper's position comes with both.
+        tool_rotation: a rotation vector [rad] that the tool's first one of a connection is written close to, with
+            action=tcp. Of a tool that points down there are two as long, and the controller's jumps from one to the
+            other. Choose one near the middle of the task's: a tool that points down and turns by less than half a turn
+            from (pi, 0, 0) has no jump.
         gripper: `robotiq` (its URCap's socket) or `none`.
         cameras: LeRobot's; one with `use_depth` gives `<name>_depth` too.
         control_rate: at which actions come [Hz]: the command's --dataset.fps or --fps.
@@ -42,6 +46,7 @@ class UR5eFollowerConfig(RobotConfig):
 
     ip: str
     action: str = "joints"
+    tool_rotation: tuple[float, ...] = (math.pi, 0.0, 0.0)
     gripper: str = "robotiq"
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     control_rate: float = 30.0
@@ -83,6 +88,10 @@ class UR5eFollowerConfig(RobotConfig):
             angles = getattr(self, name)
             if len(angles) != N_JOINTS or not all(abs(angle) <= 2 * math.pi + 1e-6 for angle in angles):
                 raise UserError(f"robot.{name} holds six angles [rad] within 2 pi of zero, got {list(angles)}.")
+        if len(self.tool_rotation) != 3 or not 0 < math.dist(self.tool_rotation, (0, 0, 0)) <= 2 * math.pi + 1e-6:
+            raise UserError(
+                f"robot.tool_rotation holds a rotation vector [rad], of up to 2 pi, got {list(self.tool_rotation)}."
+            )
         if any(lower >= upper for lower, upper in zip(self.lower, self.upper, strict=True)):
             raise UserError(f"robot.lower lies below robot.upper, got {list(self.lower)} and {list(self.upper)}.")
 

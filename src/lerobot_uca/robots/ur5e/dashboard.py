@@ -29,14 +29,18 @@ class Dashboard:
 
     def ask(self, request: str) -> str:
         """The answer."""
-        self._connection.sendall(f"{request}\n".encode())
-        return self._read()
+        return self._read(f"{request}\n")
 
-    def _read(self) -> str:
+    def _read(self, request: str = "") -> str:
         try:
+            self._connection.sendall(request.encode())
             return self._lines.readline().strip()
         except TimeoutError:
             raise UserError(f"The dashboard server of {self._ip} did not answer within {TIMEOUT:.0f} s.") from None
+        except OSError as error:
+            raise UserError(
+                f"The dashboard server of {self._ip} hung up ({error.strerror or error}): is the controller starting?"
+            ) from None
 
     def close(self) -> None:
         """Hang up."""

@@ -12,6 +12,8 @@ from lerobot_uca.robots.ur5e.channel import ArmStoppedError
 PORT = 63352
 TIMEOUT = 2.0  # [s]
 ACTIVATION_TIMEOUT = 10.0  # [s]; the fingers move through their whole range meanwhile
+ACTIVE = 3  # of STA
+HEALTH_PERIOD = 0.1  # [s]
 OPEN_COUNT, CLOSED_COUNT = 3, 230  # where a 2F-85's fingers end, of 0 to 255
 
 logger = logging.getLogger(__name__)
@@ -37,11 +39,11 @@ class RobotiqGripper:
         try:
             self._activate()
             self._position = self._read_position()
-        except TimeoutError:
+        except OSError as error:
             self._connection.close()
+            what = f"did not answer within {TIMEOUT:.0f} s" if isinstance(error, TimeoutError) else "hung up"
             raise UserError(
-                f"The gripper's URCap at {ip}:{PORT} takes connections but did not answer within {TIMEOUT:.0f} s: see "
-                "its page on the pendant."
+                f"The gripper's URCap at {ip}:{PORT} takes connections but {what}: see its page on the pendant."
             ) from None
         except BaseException:
             self._connection.close()
@@ -59,17 +61,24 @@ class RobotiqGripper:
         return int(answer.removeprefix(f"{name} "))
 
     def _activate(self) -> None:
-        if self._get("STA") != 3:
+        if self._get("STA") != ACTIVE:
             logger.info("The gripper is activated: its fingers open and close once.")
             for request in ("SET ACT 0", "SET ATR 0", "SET ACT 1"):
                 self._ask(request)
             deadline = time.monotonic() + ACTIVATION_TIMEOUT
-            while self._get("STA") != 3:
+            while self._get("STA") != ACTIVE:
                 if time.monotonic() > deadline:
                     raise UserError(f"The gripper did not become active within {ACTIVATION_TIMEOUT:.0f} s.")
                 time.sleep(0.05)
+        self._check_health()
+
+    def _check_health(self) -> None:
         if fault := self._get("FLT"):
-            raise UserError(f"The gripper reports fault {fault}: see Robotiq's manual, and reset it on the pendant.")
+            raise ArmStoppedError(
+                f"The gripper reports fault {fault}: see Robotiq's manual, and reset it on the pendant."
+            )
+        if self._get("STA") != ACTIVE:
+            raise ArmStoppedError("The gripper is not active any longer: see its page on the pendant.")
 
     def _read_position(self) -> float:
         share = (self._get("POS") - OPEN_COUNT) / (CLOSED_COUNT - OPEN_COUNT)
@@ -77,8 +86,12 @@ class RobotiqGripper:
 
     def _run(self) -> None:
         sent: int | None = None
+        checked_at = time.monotonic()
         try:
             while not self._closing.is_set():
+                if time.monotonic() - checked_at > HEALTH_PERIOD:
+                    self._check_health()
+                    checked_at = time.monotonic()
                 with self._lock:
                     requested = self._requested
                 if requested != sent:
@@ -90,15 +103,16 @@ class RobotiqGripper:
                 self._closing.wait(0.005)
             self._ask("SET GTO 0")  # or they would go on to where they were sent
         except (OSError, ArmStoppedError) as error:
+            why = str(error) if isinstance(error, ArmStoppedError) else f"The gripper no longer answers ({error})."
             with self._lock:
-                self._failure = str(error) or type(error).__name__
+                self._failure = why
 
     @property
     def position(self) -> float:
         """Measured. Raises `ArmStoppedError` where the gripper no longer answers."""
         with self._lock:
             if self._failure is not None or time.monotonic() - self._heard_at > TIMEOUT:
-                raise ArmStoppedError(f"The gripper no longer answers ({self._failure or 'no data'}).")
+                raise ArmStoppedError(self._failure or "The gripper no longer answers.")
             return self._position
 
     def request(self, position: float) -> float:

@@ -49,7 +49,8 @@ def jacobian(q: ArrayLike) -> Array:
 def inverse_kinematics(target: Array, seed: ArrayLike, *, n_steps: int = 30, tolerance: float = 1e-6) -> Array | None:
     """Joint angles (6,) near the seed at which the flange has the target's pose, or None if none are found.
 
-    Damped Gauss-Newton steps: the solution stays in the seed's branch (elbow up stays elbow up).
+    Damped Gauss-Newton steps: the solution stays in the seed's branch (elbow up stays elbow up). No joint turns by more
+    than pi.
 
     Args:
         target: T_base_flange.
@@ -57,14 +58,23 @@ def inverse_kinematics(target: Array, seed: ArrayLike, *, n_steps: int = 30, tol
         n_steps: how often to improve.
         tolerance: of the pose [m and rad].
     """
-    q = np.array(seed, dtype=np.float64)
+    start = np.array(seed, dtype=np.float64)
+    q = start.copy()
     for _ in range(n_steps):
         error = pose_error(target, flange_pose(q))
         if np.abs(error).max() < tolerance:
-            return q
+            return start + np.remainder(q - start + math.pi, 2 * math.pi) - math.pi  # without turns that lead nowhere
         J = jacobian(q)
         q += np.clip(J.T @ np.linalg.solve(J @ J.T + DAMPING**2 * np.eye(6), error), -0.5, 0.5)
     return None
+
+
+def turned_inside(q: Array, lower: ArrayLike, upper: ArrayLike) -> Array:
+    """The same pose's angles (6,), each a turn more or less where that brings it inside its range."""
+    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    turned = q - 2 * math.pi * np.sign(q)
+    is_better = ((q < low) | (q > high)) & (low <= turned) & (turned <= high)
+    return np.where(is_better, turned, q)
 
 
 def pose_error(target: Array, pose: Array) -> Array:

@@ -13,6 +13,7 @@ import signal
 import socket
 import sys
 import time
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,8 @@ from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 # well wait for half a second, and its arm stands still meanwhile.
 FREEZE_AFTER, STALE_AFTER = 0.1, 1.0
 SAFEGUARD_STOP = 5  # RTDE's safety_mode
-PAUSED = {3, 4, 5}  # RTDE's runtime_state: pausing, paused, resuming
+STOPPED, PAUSED = 1, {3, 4, 5}  # RTDE's runtime_state; the latter are pausing, paused, resuming
+PAUSES_WITHIN = 0.5  # [s]
 NEXT_DATA = 0.05  # [s]
 WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
 BRAKING = 4.0  # [rad/s^2], of servoStop
@@ -49,6 +51,7 @@ class Channel:
     def __init__(self, descriptor: int) -> None:
         self._socket = socket.socket(fileno=descriptor)
         self._received = b""
+        self._unsent: deque[Message] = deque()
 
     def receive(self) -> list[Message]:
         """The messages that have come. A driver that is gone is a `Stop`."""
@@ -75,10 +78,25 @@ class Channel:
             time.sleep(0.005)
 
     def send(self, message: Message) -> None:
-        """A state is left out where the driver does not read; anything else waits for a second."""
-        self._socket.settimeout(0 if isinstance(message, State) else 1)
+        """Where the driver does not read, a state is left out; anything else goes as soon as it does."""
+        if not isinstance(message, State):
+            self._unsent.append(message)
+        self._socket.setblocking(False)
+        self._send_unsent()
+        if isinstance(message, State) and not self._unsent:
+            with contextlib.suppress(OSError):
+                self._socket.sendall(encode(message))
+
+    def finish(self) -> None:
+        """Wait for a moment for a driver that has not read all yet."""
+        self._socket.settimeout(1)
+        self._send_unsent()
+
+    def _send_unsent(self) -> None:
         with contextlib.suppress(OSError):
-            self._socket.sendall(encode(message))
+            while self._unsent:
+                self._socket.sendall(encode(self._unsent[0]))
+                self._unsent.popleft()
 
 
 class ServoLoop:
@@ -175,6 +193,7 @@ class ServoLoop:
     def _state(self) -> State:
         receive = self._receive
         return State(
+            made_at=time.monotonic(),
             timestamp=self._timestamp,
             q=receive.getActualQ(),
             qd=receive.getActualQd(),
@@ -203,6 +222,16 @@ class ServoLoop:
                 self.brake()
             finally:
                 control.stopScript()
+                self._end_paused()
+
+    def _end_paused(self) -> None:
+        """A stop may be reported before the program is paused by it, which then does not obey the lines above."""
+        until = time.monotonic() + PAUSES_WITHIN
+        while time.monotonic() < until and self._receive.getRuntimeState() != STOPPED:
+            if self._receive.getRuntimeState() in PAUSED:
+                stop_program(self._settings.ip)
+                return
+            time.sleep(NEXT_DATA)
 
 
 def main() -> None:
@@ -225,6 +254,7 @@ def main() -> None:
         if loop is not None:
             with contextlib.suppress(Exception):
                 loop.end()
+        channel.finish()
         os._exit(0)  # ur_rtde's threads and destructors may hang or crash
 
 

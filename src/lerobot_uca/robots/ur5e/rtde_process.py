@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import logging
+import math
 import signal
 import socket
 import subprocess
@@ -27,6 +28,7 @@ from lerobot_uca.robots.ur5e.channel import (
 
 START_TIMEOUT = 20.0  # [s]
 HEARTBEAT_TIMEOUT = 1.5  # [s]
+FRESH = 0.1  # [s]; a driver that was suspended finds older states, of an arm that has stopped since
 STOP_TIMEOUT = 3.0  # [s]
 
 logger = logging.getLogger(__name__)
@@ -43,7 +45,6 @@ class RtdeProcess:
             )
         self._changed = threading.Condition()
         self._state: State | None = None
-        self._heard_at = 0.0
         self._failure: str | None = None
         self._socket, theirs = socket.socketpair()
         with theirs:
@@ -78,7 +79,7 @@ class RtdeProcess:
     def _take(self, message: Message) -> None:
         with self._changed:
             if isinstance(message, State):
-                self._state, self._heard_at = message, time.monotonic()
+                self._state = message
             elif isinstance(message, Failure):
                 self._failure = message.text
             elif isinstance(message, Note):
@@ -101,17 +102,24 @@ class RtdeProcess:
             return self._state
 
     def state(self) -> State:
-        """The newest. Raises `ArmStoppedError` where the arm has stopped or nothing has been heard for a while."""
+        """The newest, which a busy computer may have to be waited for.
+
+        Raises `ArmStoppedError` where the arm has stopped or nothing has been heard for a while.
+        """
         with self._changed:
+            self._changed.wait_for(lambda: self._failure or self._age < FRESH, HEARTBEAT_TIMEOUT)
             self._raise_failure()
             assert self._state is not None  # the constructor waits for one
-            age = time.monotonic() - self._heard_at
-            if age < HEARTBEAT_TIMEOUT:
+            if self._age < FRESH:
                 return self._state
             # Whoever asks from now on is told this, not that the process was killed.
-            self._failure = f"The process that talks to the arm has not been heard for {age:.1f} s and was ended."
+            self._failure = f"The process that talks to the arm has not been heard for {self._age:.1f} s and was ended."
         self.kill()  # the controller's watchdog then ends its program
         raise ArmStoppedError(self._failure)
+
+    @property
+    def _age(self) -> float:
+        return math.inf if self._state is None else time.monotonic() - self._state.made_at
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

@@ -27,6 +27,7 @@ from lerobot_uca.robots.ur5e.kinematics import (
     inverse_kinematics,
     pose_from_vector,
     pose_to_vector,
+    turned_inside,
 )
 from lerobot_uca.robots.ur5e.limits import clip_target
 from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
@@ -39,8 +40,11 @@ ARM_TELLS_WITHIN = 0.2
 """[s] An emergency stop takes the gripper's power, too; where that is noticed first, the arm's reason follows."""
 
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
+MEANT_IN_METRES = 2.0  # the arm reaches 0.85 m
+GRIPPER_RANGE = (-0.5, 1.5)  # what may be meant as 0 to 1
 ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
 SETTLING = 0.4  # [s], after which an arm whose setpoint is at the first target is as near as it gets
+NOTICEABLE_SHARE = 0.02  # of the gripper's range
 NOTICEABLE = 1e-3  # [rad]: what is clipped by less is not worth a line
 
 logger = logging.getLogger(__name__)
@@ -119,7 +123,7 @@ class UR5eFollower(Robot):
         )
         self._arm = RtdeProcess(settings)
         try:
-            self._tcp_near = np.array(self._arm.state().tcp)
+            self._tcp_near = np.array([0.0, 0.0, 0.0, *config.tool_rotation])
             if config.gripper == "robotiq":
                 self._gripper = RobotiqGripper(config.ip)
             for name, camera in self.cameras.items():
@@ -186,6 +190,8 @@ class UR5eFollower(Robot):
             self._clipping.note(wanted - target)
             self._ease(target)
         self._previous, self._sent_at = target, time.monotonic()
+        if self._gripper is not None:
+            self._clipping.note_gripper(values[6])
         commanded_gripper = [] if self._gripper is None else [self._gripper.request(values[6])]
         commanded = target if self.config.action == "joints" else self._tcp_at(target, state)
         return dict(zip(self._keys, [*commanded.tolist(), *commanded_gripper], strict=True))
@@ -205,13 +211,31 @@ class UR5eFollower(Robot):
                 f"{', '.join(missing) or '-'}; unknown: {', '.join(unknown) or '-'}. "
                 "Is the dataset or the policy another robot's?"
             )
-        values = np.array([float(action[key]) for key in self._keys])  # replay hands over tensors without dimensions
+        try:  # replay hands over tensors without dimensions
+            values = np.array([float(action[key]) for key in self._keys])
+        except (TypeError, ValueError) as error:
+            raise UserError(f"An action's values are numbers, one for each name ({error}).") from None
         if not np.isfinite(values).all():
             bad = ", ".join(key for key, value in zip(self._keys, values, strict=True) if not math.isfinite(value))
             raise UserError(f"An action's values are finite numbers, got others for {bad}.")
-        if self.config.action == "joints" and (largest := np.abs(values[:6]).max()) > MEANT_IN_RADIANS:
-            raise UserError(f"Joint actions are angles in radians, within 2 pi of zero, got {largest:.1f}. Degrees?")
+        self._check_units(values)
         return values
+
+    def _check_units(self, values: Array) -> None:
+        if self.config.action == "joints":
+            if (largest := np.abs(values[:6]).max()) > MEANT_IN_RADIANS:
+                raise UserError(
+                    f"Joint actions are angles in radians, within 2 pi of zero, got {largest:.1f}. Degrees?"
+                )
+        else:
+            if (angle := np.linalg.norm(values[3:6])) > MEANT_IN_RADIANS:
+                raise UserError(f"A rotation vector is in radians, no longer than 2 pi, got {angle:.1f}. Degrees?")
+            if (distance := np.linalg.norm(values[:3])) > MEANT_IN_METRES:
+                raise UserError(
+                    f"A position is in metres, within {MEANT_IN_METRES:g} of the base, got {distance:.1f}. Millimetres?"
+                )
+        if len(values) > 6 and not GRIPPER_RANGE[0] <= values[6] <= GRIPPER_RANGE[1]:
+            raise UserError(f"The gripper's position lies in 0 (open) to 1 (closed), got {values[6]:g}. Another scale?")
 
     def _joint_target(self, values: Array, state: State) -> Array:
         """The joint angles (6,) that an action means."""
@@ -222,7 +246,8 @@ class UR5eFollower(Robot):
         if q is None:
             self._clipping.note_unreachable(values)
             return self._previous
-        return q
+        # Slowly it may turn the other way round. In a stream it would not be where the action says meanwhile.
+        return q if state.is_servoing else turned_inside(q, self.config.lower, self.config.upper)
 
     def _tcp_at(self, q: Array, state: State) -> Array:
         return pose_to_vector(flange_pose(q) @ _tool(state), near=self._tcp_near)
@@ -317,6 +342,12 @@ class ClippingReport:
                 "%d targets were clipped, by up to %.3f rad (%s).", self._n, self._largest[joint], JOINTS[joint]
             )
             self._due, self._largest, self._n = time.monotonic() + self._every, np.zeros(6), 0
+
+    def note_gripper(self, position: float) -> None:
+        """A gripper's position, which may lie outside 0 to 1."""
+        if not -NOTICEABLE_SHARE <= position <= 1 + NOTICEABLE_SHARE and time.monotonic() >= self._due:
+            logger.warning("The gripper's position %.2f was clipped to 0 (open) to 1 (closed).", position)
+            self._due = time.monotonic() + self._every
 
     def note_unreachable(self, pose: Array) -> None:
         """A pose that the arm cannot take."""

@@ -1,9 +1,11 @@
+import re
 import sys
 
 import numpy as np
 import pytest
 from tests.robots.conftest import free_address, wait_until
 
+from lerobot_uca import commands
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.cameras import DepthCamera
 from lerobot_uca.robots.ur5e.kinematics import flange_pose
@@ -134,3 +136,21 @@ def test_a_world_put_back_has_its_gripper_open():
         time = world.scene.data.time
         wait_until(lambda: world.scene.data.time > time + 0.5)
         assert world.controller.gripper.get("POS") == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--seed=-1"], "--seed is at least 0, got -1"),
+        (["--width=0"], "--width is at least 1, got 0"),
+        (["--noise=nan"], "--noise is at least 0, got nan"),
+        (["--ip=127.0.0.9", "--calibration={file}/none"], "--calibration '.*none' cannot be written"),
+    ],
+)
+def test_wrong_options_are_one_line(options, message, tmp_path, capfd, monkeypatch):
+    (tmp_path / "file").touch()
+    options = [option.format(file=tmp_path / "file") for option in options]
+    monkeypatch.setattr(sys, "argv", ["lerobot-uca-ur5e-sim", *options])
+    with pytest.raises(SystemExit) as end:
+        commands.ur5e_sim()
+    assert re.search(message, f"{end.value.code} {capfd.readouterr().err}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import Calibration
 from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 from lerobot_uca.robots.ur5e.sim.controller import Controller
@@ -69,7 +70,11 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--camera", default="top", help="its name in the robot's configuration [%(default)s]")
     parser.add_argument("--width", type=int, default=160, help="of the calibrated image [pixels] [%(default)s]")
     parser.add_argument("--height", type=int, default=120, help="of the calibrated image [pixels] [%(default)s]")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    for name, least in (("seed", 0), ("width", 1), ("height", 1), ("noise", 0), ("holes", 0), ("after", 0)):
+        if not getattr(options, name) >= least:
+            parser.error(f"--{name} is at least {least}, got {getattr(options, name)}")
+    return options
 
 
 def main() -> None:
@@ -78,7 +83,10 @@ def main() -> None:
     prefer_this_thread()  # the simulated world's time is the real one
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if options.calibration is not None:
-        file = write_calibration(options.calibration, options.camera, options.width, options.height)
+        try:
+            file = write_calibration(options.calibration, options.camera, options.width, options.height)
+        except OSError as error:
+            raise UserError(f"--calibration '{options.calibration}' cannot be written: {error}") from error
         logger.info("Calibration of camera '%s': %s", options.camera, file)
     with SimulatedWorld(options.ip, Noise(options.noise, options.holes)) as world:
         world.service.reset(options.task, options.seed, with_arm=True)
