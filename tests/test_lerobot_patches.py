@@ -337,6 +337,12 @@ def test_a_configuration_is_found_by_its_name(tmp_path, monkeypatch):
     assert own.steps == 7, "the user's own file of that name comes first"
 
 
+@pytest.mark.parametrize("name", ["uca_flow_smal", "configs/mine.yaml"])
+def test_a_misspelt_configuration_is_one_line(name):
+    with pytest.raises(UserError, match=rf"Unknown configuration '{name}'\. This package's: .*uca_flow_small"):
+        TrainPipelineConfig.from_pretrained(name, cli_args=[])
+
+
 @pytest.mark.parametrize("path", sorted(configs.FOLDER.glob("*.yaml")), ids=lambda path: path.stem)
 def test_a_configuration_holds_only_what_lerobot_reads(path):
     config = TrainPipelineConfig.from_pretrained(path, cli_args=["--dataset.repo_id=test/data"])

@@ -256,6 +256,49 @@ def test_invalid_points_count_nowhere(tmp_path, shape, is_batched, monkeypatch):
     assert policy.select_action(pre(LeRobotDataset("test/random", root=tmp_path / "data")[0])).isfinite().all()
 
 
+def test_invalid_points_count_nowhere_in_sampled_clouds(tmp_path):
+    """Of 32 points the policy looks at 8 valid ones, here of a mask that a rename_map alone pairs with its cloud."""
+
+    def mask(frame, *_):
+        frame["observation.seen"][:] = False
+        frame["observation.seen"][:20] = True
+        frame["observation.scan"][20:] = 1e6
+
+    both = {**features("observation.scan"), "observation.seen": {"dtype": "bool", "shape": (N_POINTS,), "names": None}}
+    write_dataset(tmp_path / "data", features=both, change=mask)
+    write_dataset(tmp_path / "before")
+    checkpoint = train(tmp_path / "before", tmp_path / "checkpoint", policy={"n_points": 8})
+    renaming = {"observation.scan": OBS_POINT_CLOUD, "observation.seen": f"{OBS_POINT_CLOUD}.valid_mask"}
+    trained = train(tmp_path / "data", tmp_path / "new", checkpoint=checkpoint, rename_map=renaming)
+    scan = columns(tmp_path / "data", "observation.scan")
+    np.testing.assert_allclose(saved(trained)[f"{OBS_POINT_CLOUD}.max"], scan[:, :20].max(axis=(0, 1)), rtol=1e-6)
+
+
+def test_a_further_training_begins_its_average_anew(damaged, dataset_root, tmp_path):
+    """And not with the slow decay of the one before, in which what is evaluated would remain what it was."""
+    file = damaged / "model.safetensors"
+    weights = {name: value + 1 if name.startswith("ema_model.") else value for name, value in load_file(file).items()}
+    save_file({**weights, "ema_step": torch.tensor(16_000)}, file)
+    after = load_file(train(dataset_root, tmp_path / "new", checkpoint=damaged) / "model.safetensors")
+    assert after["ema_step"] == 1
+    names = [name.removeprefix("model.") for name in after if name.startswith("model.")]
+    assert names
+    assert all(torch.equal(after[f"ema_model.{name}"], after[f"model.{name}"]) for name in names)
+
+
+@pytest.mark.parametrize("mapping", [{"STATE": "MEAN_STD"}, {"ACTION": "MIN_MAX"}, {}])
+def test_what_is_not_normalised_is_named(dataset_root, tmp_path, mapping):
+    with pytest.raises(UserError, match=r"must name STATE \(which the cloud is, too\) and ACTION, got"):
+        train(dataset_root, tmp_path / "new", policy={"normalization_mapping": mapping})
+
+
+def test_an_adapter_alone_is_not_a_policy(checkpoint, tmp_path):
+    shutil.copytree(checkpoint, tmp_path / "adapter")
+    (tmp_path / "adapter" / "model.safetensors").rename(tmp_path / "adapter" / "adapter_model.safetensors")
+    with pytest.raises(UserError, match="holds a PEFT adapter alone"):
+        load(tmp_path / "adapter")
+
+
 @pytest.mark.parametrize("is_batched", [True, False])
 def test_a_frame_without_valid_points_is_named(tmp_path, is_batched, monkeypatch):
     if not is_batched:

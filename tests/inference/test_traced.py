@@ -126,12 +126,14 @@ def test_threads_follow_the_work(monkeypatch):
 
 
 @every_runtime
-def test_one_function_serves_all_shapes_and_keeps_the_latest_traces(runtime):
+def test_one_function_serves_all_shapes_and_keeps_the_latest_traces(runtime, caplog):
     network, function = make_network(), runtime(call)
-    for shape in ((1, 3), (5, 3), (2, 7, 3), (1, 3), (6, 3), (7, 3)):
+    for shape in ((1, 3), (5, 3), (2, 7, 3), (1, 3), (6, 3), (7, 3), (8, 3)):
         x = torch.randn(shape)
         torch.testing.assert_close(function(network, x)[0], network(x).detach(), atol=1e-5, rtol=0)
-    assert [shape for (shape,) in function._traces] == [(2, 7, 3), (1, 3), (6, 3), (7, 3)]
+    assert [shape for (shape,) in function._traces] == [(1, 3), (6, 3), (7, 3), (8, 3)]
+    (line,) = caplog.messages  # of two shapes that took another's place
+    assert "policy.n_points makes clouds uniform" in line
 
 
 @every_runtime

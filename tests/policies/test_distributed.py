@@ -51,15 +51,23 @@ def test_one_process_draws_as_without():
 # `lerobot-train`, whose processes also write their averaged weights.
 TRAIN = """
 import os
+import torch
 from lerobot.scripts import lerobot_train
 from safetensors.torch import save_file
 import lerobot_policy_uca_flow
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 update = PointCloudPolicy.update
 def update_and_write(policy):
     update(policy)
     save_file(policy.ema_model.state_dict(), f"{os.environ['FOLDER']}/{os.environ['RANK']}.safetensors")
 PointCloudPolicy.update = update_and_write
+loss = UCAFlowPolicy.compute_loss
+def loss_and_write(policy, *inputs):
+    with open(f"{os.environ['FOLDER']}/draws_{os.environ['RANK']}.txt", "a") as file:
+        print(torch.get_rng_state().sum().item(), file=file)
+    return loss(policy, *inputs)
+UCAFlowPolicy.compute_loss = loss_and_write
 lerobot_train.main()
 """
 
@@ -92,3 +100,5 @@ def test_accelerate_trains_one_policy_in_two_processes(dataset_root, tmp_path):
     for name, weight in first.items():
         assert torch.equal(weight, second[name]), name
         assert torch.equal(weight, saved[f"ema_model.{name}"]), name
+    states = [(tmp_path / f"draws_{rank}.txt").read_text().split() for rank in range(2)]
+    assert len({*states[0], *states[1]}) == 60  # each draws noise and times of its own in every step

@@ -58,6 +58,7 @@ class TracedFunction(ABC):
         self._network: nn.Module | None = None
         self._weights: _Weights | None = None
         self._traces: OrderedDict[tuple[torch.Size, ...], Run] = OrderedDict()  # the latest used one is the last
+        self._has_said = False
 
     def __reduce__(self) -> tuple[type["TracedFunction"], tuple[Function]]:
         return type(self), (self.eager,)  # traces can be neither copied nor sent to another process
@@ -82,10 +83,20 @@ class TracedFunction(ABC):
         if run is None:
             if len(self._traces) == MAX_TRACES:
                 self._traces.popitem(last=False)
+                self._say_that_shapes_change(shapes)
             run = self._traces[shapes] = self._trace(network, shapes)
         elif len(self._traces) > 1:
             self._traces.move_to_end(shapes)
         return run(inputs)
+
+    def _say_that_shapes_change(self, shapes: Sequence[torch.Size]) -> None:
+        if not self._has_said:
+            self._has_said = True
+            logger.warning(
+                "%s prepares itself anew, which takes about half a second, for each new shape of the inputs, and keeps "
+                "%d; the last: %s. policy.n_points makes clouds uniform, policy.inference=eager takes any shape.",
+                *(self.runtime, MAX_TRACES, [tuple(shape) for shape in shapes]),
+            )
 
     def _trace(self, network: nn.Module, shapes: Sequence[torch.Size]) -> Run:
         model = to_onnx(self.eager, network, shapes, [f"input_{index}" for index in range(len(shapes))])

@@ -64,7 +64,7 @@ def normalise_what_is_trained() -> None:
         def make_train_eval_datasets(config: TrainPipelineConfig) -> Any:
             datasets = make(config)
             if isinstance(config.policy, PointCloudPolicyConfig):
-                _take_calibrations(config, config.policy, datasets[0])
+                _begin(config, config.policy, datasets[0])
                 for dataset in filter(None, datasets):
                     _normalise_by_chosen_episodes(config, config.policy, dataset)
             return datasets
@@ -74,8 +74,9 @@ def normalise_what_is_trained() -> None:
     replace(factory.make_train_eval_datasets, checked)
 
 
-def _take_calibrations(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:
-    """Tell the policy which calibrations depth images bring along, and whether it knows theirs from before."""
+def _begin(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:
+    """Tell the policy whether this is a new training, and which calibrations depth images bring along."""
+    policy.is_new_training = not config.resume
     recorded = {}
     is_read = hasattr(dataset, "hf_dataset") and find_point_cloud(dataset.meta.features) is None  # not streamed
     if is_read and not (policy.depth.calibration or config.resume):
@@ -98,18 +99,19 @@ def _normalise_by_chosen_episodes(config: TrainPipelineConfig, policy: PointClou
     masks = {key_of[name]: key_of.get(valid_mask(name, renamed) or "") for name in used if name}
     check_finite(dataset, masks)
     cloud_name = find_point_cloud(renamed)
-    if policy.n_points is not None and cloud_name is not None and isinstance(dataset, BatchedDataset):
-        _sample_clouds(PointCloudProcessorStep(policy.n_points, policy.colour), dataset, key_of[cloud_name])
     if dataset.meta.stats:
         dataset.meta.stats = {**dataset.meta.stats, **chosen_statistics(dataset, masks)}
+    if policy.n_points is not None and cloud_name is not None and isinstance(dataset, BatchedDataset):
+        key = key_of[cloud_name]
+        _sample_clouds(PointCloudProcessorStep(policy.n_points, policy.colour), dataset, key, masks[key])
 
 
-def _sample_clouds(step: PointCloudProcessorStep, dataset: BatchedDataset, key: str) -> None:
+def _sample_clouds(step: PointCloudProcessorStep, dataset: BatchedDataset, key: str, mask_key: str | None) -> None:
     """Sample all clouds once: the processor's step would sample them again in every epoch."""
     columns, n_points = dataset.columns(), step.n_points
     if columns is None or n_points is None or columns.tensors[key].shape[1] <= n_points:
         return
-    mask = columns.tensors.pop(valid_mask(key, columns.tensors) or "", None)
+    mask = columns.tensors.pop(mask_key, None) if mask_key else None
     clouds = columns.tensors[key]
     rows = tqdm(range(len(clouds)), desc=f"Sampling {n_points} of {clouds.shape[1]} points", unit="cloud")
     sampled = [step.uniform(clouds[row].float(), None if mask is None else mask[row]) for row in rows]

@@ -87,7 +87,13 @@ def find_configs_by_name() -> None:
 
     def named(load: Callable[..., Any]) -> Callable[..., Any]:
         def from_pretrained(cls: type, pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
-            return load(cls, configs.path_of(str(pretrained_name_or_path)) or pretrained_name_or_path, **kwargs)
+            path = configs.path_of(str(pretrained_name_or_path)) or Path(pretrained_name_or_path)
+            if not path.exists() and (len(path.parts) == 1 or path.suffix):  # a repository of the Hub is 'user/name'
+                raise UserError(
+                    f"Unknown configuration '{pretrained_name_or_path}'. This package's: {', '.join(configs.NAMES)}; "
+                    "or the path of a file."
+                )
+            return load(cls, path if path.exists() else pretrained_name_or_path, **kwargs)
 
         return from_pretrained
 

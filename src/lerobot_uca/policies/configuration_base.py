@@ -114,6 +114,11 @@ class PointCloudPolicyConfig(PreTrainedConfig):
     # Steps of linear warm-up, followed by a cosine to zero over the remaining steps.
     scheduler_warmup_steps: int = within(500, least=0)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.is_new_training = False
+        """Whether a checkpoint is loaded to be trained anew in this process, and not to be resumed. It is not saved."""
+
     def validate_sizes(self) -> None:
         """Raise a `UserError` for values outside their bounds or that do not fit together."""
         check_bounds(self, "policy")
@@ -126,7 +131,12 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             )
         if self.dtype not in ("float32", "bfloat16"):
             raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
-
+        kinds = {str(getattr(kind, "value", kind)) for kind in self.normalization_mapping}
+        if not {"STATE", "ACTION"} <= kinds:  # of what is not named LeRobot passes the raw values on
+            raise UserError(
+                "policy.normalization_mapping must name STATE (which the cloud is, too) and ACTION, got "
+                f"{', '.join(sorted(kinds)) or 'nothing'}. IDENTITY leaves one as it is."
+            )
         if self.inference not in BACKENDS:
             raise UserError(f"policy.inference must be one of {', '.join(BACKENDS)}, got '{self.inference}'.")
 

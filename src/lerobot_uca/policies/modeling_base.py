@@ -66,6 +66,9 @@ def _without_inference_mode() -> Iterator[None]:
         yield
 
 
+ADAPTER = "adapter_model.safetensors"
+
+
 class MethodLoss(NamedTuple):
     """A method's loss for each sample, (B,), and its parts to log, each (B,)."""
 
@@ -278,11 +281,20 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         map_location: str,
         strict: bool,  # noqa: ARG003 (LeRobot passes False)
     ) -> Self:
-        """Load weights, all of them: LeRobot would only warn of missing ones and evaluate a half-random policy."""
+        """Load weights, all of them: LeRobot would only warn of missing ones and evaluate a half-random policy.
+
+        A new training that starts from them begins its average anew. With the old one's slow decay what is evaluated
+        would remain mostly what the checkpoint was: of 16000 steps, 66 % of it after 600 more.
+        """
         if not Path(model_file).is_file():
+            if Path(model_file).with_name(ADAPTER).is_file():
+                raise UserError(
+                    f"The checkpoint holds a PEFT adapter alone ('{ADAPTER}'): merge it into its policy and save that, "
+                    "PeftModel.merge_and_unload() and save_pretrained()."
+                )
             raise UserError(f"The checkpoint has no weights: '{model_file}' does not exist.")
         try:
-            return super()._load_as_safetensor(model, model_file, map_location, strict=True)
+            loaded = super()._load_as_safetensor(model, model_file, map_location, strict=True)
         except (SafetensorError, RuntimeError) as error:
             reason = " ".join(str(error).split())
             if isinstance(error, RuntimeError) and "state_dict" not in reason:
@@ -290,6 +302,9 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
             raise UserError(
                 f"'{model_file}' does not hold the weights of this '{cls.name}' policy: {shorten(reason, 300)}"
             ) from error
+        if loaded.config.is_new_training:
+            loaded.ema_step.zero_()
+        return loaded
 
 
 def _encode_frame(encoder: nn.Module, cloud: Tensor, state: Tensor) -> tuple[Tensor]:
