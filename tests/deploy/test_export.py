@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import onnx
@@ -117,6 +118,19 @@ def test_a_seed_reproduces_actions_and_reset_forgets(exported):
     np.testing.assert_array_equal(first, b.select_action(cloud, state))
     a.reset()
     assert not np.array_equal(a.select_action(cloud, state), first)  # fresh noise, so it was planned anew
+
+
+def test_the_runner_draws_gaussian_noise_of_its_seed(exported):
+    policies = [OnnxPolicy(exported, seed=seed) for seed in (3, 3, 4)]
+    drawn = []
+    for policy in policies:
+        policy._noise_shape = (200, 100)
+        policy._session = SimpleNamespace(run=lambda _, values: drawn.append(values["noise"]) or (np.zeros(1), 0.0))
+        policy.plan(np.zeros((2, N_POINTS, 3)), np.zeros((2, N_STATES)))
+    assert abs(drawn[0].mean()) < 0.03
+    assert abs(drawn[0].std() - 1) < 0.03
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert not np.array_equal(drawn[0], drawn[2])
 
 
 def test_the_runner_needs_onnxruntime_and_numpy_alone(exported):

@@ -21,6 +21,7 @@ from lerobot_uca.envs.metaworld import (
 )
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.geometry import Crop, opengl_from_opencv
+from lerobot_uca.protocol.cells import PAPER_GROUPS
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,7 @@ def test_observations_fit_the_spaces(env):
 def test_the_camera_is_metaworlds_corner2_moved(env):
     simulator = metaworld._make_simulator("drawer-close")
     camera = simulator.model.camera("corner2").id
+    assert CLOUD_CAMERA.position == pytest.approx((0.6, 0.295, 0.8))  # the baselines'
     simulator.model.cam_pos[camera] = CLOUD_CAMERA.position
     mujoco.mj_forward(simulator.model, simulator.data)
     rotation = opengl_from_opencv(np.asarray(CLOUD_CAMERA.X_world_camera))[:3, :3]
@@ -208,6 +210,10 @@ def test_the_papers_tasks_have_its_counts():
     groups = task_groups()
     counts = [len(set(groups["paper"]) & set(groups[name])) for name in ("easy", "medium", "hard", "very_hard")]
     assert counts == [21, 4, 4, 5]
+    for name in ("easy", "medium", "hard", "very_hard"):
+        assert {task.removeprefix("metaworld/") for task in PAPER_GROUPS[name]} == set(groups["paper"]) & set(
+            groups[name]
+        )
     assert len(groups["all"]) == 50
 
 

@@ -72,3 +72,15 @@ def test_the_loss_is_smallest_at_the_best_prediction():
 
     assert loss(0) < min(loss(0.05), loss(-0.05))
     assert loss(0) < STD**2  # it sees something of x
+
+
+def test_all_steps_are_trained():
+    seen = set()
+
+    def network(z, k, o):
+        seen.update(k.tolist())
+        return z
+
+    x = torch.zeros(3000, 1, 1)
+    diffusion_loss(network, make_scheduler(K), x, torch.empty(3000, 0), torch.ones(3000, 1, dtype=torch.bool))
+    assert seen == set(range(K))

@@ -3,6 +3,7 @@
 import torch
 from lerobot.optim import AdamWConfig
 
+from lerobot_uca.policies.configuration_uca_flow import UCAFlowConfig
 from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
 
@@ -21,3 +22,12 @@ def test_the_fused_step_is_lerobots():
         results.append(weight.detach())
     torch.testing.assert_close(*results)
     assert not torch.allclose(results[0], start, atol=1e-2)
+
+
+def test_the_configurations_options_reach_optimiser_and_schedule():
+    wanted = {"lr": 0.3, "betas": (0.1, 0.2), "eps": 0.4, "weight_decay": 0.5, "grad_clip_norm": 0.6}
+    options = {f"optimizer_{name}": value for name, value in wanted.items()}
+    config = UCAFlowConfig(device="cpu", push_to_hub=False, scheduler_warmup_steps=7, **options)
+    preset = config.get_optimizer_preset()
+    assert {name: getattr(preset, name) for name in wanted} == wanted
+    assert config.get_scheduler_preset().num_warmup_steps == 7

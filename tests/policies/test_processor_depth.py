@@ -479,6 +479,8 @@ def test_a_policy_trained_on_unknown_clouds_does_not_take_depth(tiff, calibrated
     ],
 )
 def test_the_encoders_range_is_taken_from_the_dataset(info, near, far, unit, tiff, calibrated):
+    if info.get("depth_unit") == "m":  # LeRobot reads millimetres, whatever the camera's unit
+        make_calibration(depth_unit=2.5e-4).write(calibrated)
     features = {
         **tiff.meta.features,
         DEPTH_KEY: {**tiff.meta.features[DEPTH_KEY], "info": {"is_depth_map": True, **info}},

@@ -1,4 +1,7 @@
+from types import SimpleNamespace
+
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from lerobot.envs.utils import freeze_after_episode_end
@@ -7,8 +10,11 @@ from tests.builders import N_ACTIONS, N_POINTS, make_config
 
 from lerobot_uca.envs import metaworld
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
+from lerobot_uca.envs.observers import OBSERVERS
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
-from lerobot_uca.protocol.evaluation import PolicyPlan, run_episodes
+from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.evaluation import PolicyPlan, Running, not_watched, run_episodes
+from lerobot_uca.protocol.run_cell import make_env as make_env_of_cell
 
 SEEDS = [11, 12, 13]
 N_STEPS = 10
@@ -95,3 +101,24 @@ def test_only_what_the_policy_looks_at_is_observed(policy, monkeypatch):
     plan = PolicyPlan(policy, same, same)
     list(run_episodes(make_env, policy.config, plan, SEEDS[:1], n_envs=1))
     assert observed == [0, 2, 3, 5, 6, 8, 9]
+
+
+def test_an_episode_is_successful_once_it_was_and_ends_when_it_is_told():
+    told = iter([(1.0, False, False, True), (1.0, False, False, False), (1.0, True, False, False)])
+    env = SimpleNamespace(
+        reset=lambda seed: ({}, {}),
+        act=lambda action: (*(step := next(told))[:3], {"is_success": step[3]}),
+        observe=dict,
+    )
+    running = Running(env, 7, SimpleNamespace(observation_delta_indices=[-1, 0], n_action_steps=4), not_watched)
+    running.execute(np.zeros((4, N_ACTIONS), np.float32))
+    assert running.is_over
+    assert running.result()[:4] == (7, True, 3.0, 3)
+
+
+@pytest.mark.parametrize("observation", ["point_cloud", "object_cloud"])
+def test_a_cell_is_evaluated_in_its_trainings_clouds(observation):
+    plan = SimpleNamespace(config=SimpleNamespace(n_points=16, observation=observation))
+    env = make_env_of_cell(Cell("metaworld/reach", "uca_flow", 0), plan)()
+    assert type(env.observer) is OBSERVERS[observation]
+    assert env.n_points == 16

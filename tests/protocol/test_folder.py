@@ -1,3 +1,4 @@
+import fcntl
 import subprocess
 import sys
 
@@ -48,6 +49,9 @@ def test_demonstrations_are_written_while_their_folder_is_held(tmp_path):
     folder = RunFolder.create(tmp_path, make_setting())
     with folder.demonstrations(CELL) as dataset, whole_folder(dataset) as unfinished:
         unfinished.mkdir()
+        claim = dataset.with_name(f".{dataset.name}.claim")
+        with claim.open() as file, pytest.raises(BlockingIOError):  # by one process at a time
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     assert dataset.is_dir()
 
 

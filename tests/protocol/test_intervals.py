@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lerobot_uca.protocol.intervals import mean_difference, mean_rate, wilson
+from lerobot_uca.protocol.intervals import _variances, mean_difference, mean_rate, wilson
 
 
 @pytest.mark.parametrize(
@@ -116,3 +116,17 @@ def test_an_order_is_decided_only_where_the_interval_holds_no_zero():
     assert mean_difference([differences]).is_decided
     assert mean_difference([-differences]).is_decided
     assert not mean_difference([np.array([[1] * 8 + [-1] * 6 + [0] * 86])]).is_decided
+
+
+def test_the_variances_are_those_of_crossed_seeds_and_episodes():
+    """The means by episode are 1, 1/2, 1/2, 0, by seed 3/4 and 1/4; each of the eight residuals is 1/4 in size."""
+    within = 8 / 16 / (3 * 1) / 8  # their mean square, of the mean over all
+    episodes, seeds_part = _variances(np.array([[1, 1, 1, 0], [1, 0, 0, 0]]))
+    assert episodes == (pytest.approx(0.5 / 3 / 4), 3)
+    assert seeds_part == (pytest.approx(0.125 / 2 - within), 1)
+
+
+def test_seeds_that_differ_by_chance_add_nothing_mostly():
+    rng = np.random.default_rng(0)
+    parts = [_variances(rng.random((3, 100)) < 0.5)[1][0] for _ in range(500)]
+    assert np.mean(np.equal(parts, 0)) > 0.5

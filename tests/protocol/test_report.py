@@ -408,3 +408,13 @@ def test_a_run_without_results(tmp_path):
     with pytest.raises(UserError, match="There are no results yet"):
         main(["report", str(folder.path), f"--output={tmp_path}/report"])
     assert not (tmp_path / "report").exists()
+
+
+def test_a_difference_names_who_is_better(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", SETTING)
+    for policy, n_final in (("uca_flow", 60), ("adaln", 80), ("mp1", 61)):
+        add_cell(folder, Cell(REACH, policy, 0), n_final)
+    main(["report", str(folder.path), f"--output={tmp_path / 'report'}"])
+    verdicts = {row[0]: row[-1] for row in read_csv(tmp_path / "report" / "differences.csv")}
+    assert verdicts["UCA-Flow minus - Unified/a: AdaLN"] == "- Unified/a: AdaLN is better"
+    assert verdicts["UCA-Flow minus MP1"] == "undecided"

@@ -88,7 +88,8 @@ def find_configs_by_name() -> None:
     def named(load: Callable[..., Any]) -> Callable[..., Any]:
         def from_pretrained(cls: type, pretrained_name_or_path: str | Path, **kwargs: Any) -> Any:
             path = configs.path_of(str(pretrained_name_or_path)) or Path(pretrained_name_or_path)
-            is_file_name = len(path.parts) == 1 or path.suffix in (".yaml", ".yml", ".json")  # the Hub's are 'user/name'
+            # A repository of the Hub is "user/name".
+            is_file_name = len(path.parts) == 1 or path.suffix in (".yaml", ".yml", ".json")
             if is_file_name and not path.exists():
                 raise UserError(
                     f"Unknown configuration '{pretrained_name_or_path}'. This package's: {', '.join(configs.NAMES)}; "

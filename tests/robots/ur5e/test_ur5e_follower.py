@@ -23,6 +23,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.robots.ur5e import rtde_client
 from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Note, State, decode
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
+from lerobot_uca.robots.ur5e.dashboard import Dashboard
 from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_from_vector, pose_to_vector, rotation_matrix
 from lerobot_uca.robots.ur5e.sim.controller import Controller
 from lerobot_uca.robots.ur5e.sim.gripper import CLOSED_COUNT, OPEN_COUNT
@@ -481,7 +482,7 @@ def test_a_killed_process_leaves_the_arm_standing_still(controller, tmp_path, vi
     client = int(parent.stdout.readline())
     wait_until(lambda: speed(controller) > 0.1)
     os.kill(client if victim == "client" else parent.pid, KILLS[victim])
-    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED)
+    wait_until(lambda: controller.robot.runtime == Runtime.STOPPED, 6)  # the watchdog's second, on a busy machine
     wait_until(lambda: stands_still(controller))
     assert not controller.robot.stop_reason
     parent.wait(20)
@@ -716,6 +717,22 @@ def test_local_control_is_refused(controller, tmp_path):
     controller.dashboard.is_remote = False
     with pytest.raises(UserError, match="remote control"):
         make_robot(controller, tmp_path).connect()
+
+
+@pytest.mark.parametrize(
+    ("question", "answer", "message"),
+    [
+        ("robotmode", "Robotmode: IDLE", r"not ready \(robot mode IDLE\)"),
+        ("PolyscopeVersion", "URSoftware 3.15.8.106339", r"PolyScope 3\.15\.8 is not supported"),
+        ("safetystatus", "Safetystatus: RECOVERY", "safety status is RECOVERY"),
+    ],
+)
+def test_a_controller_that_is_not_ready_is_refused(controller, tmp_path, monkeypatch, question, answer, message):
+    ask = Dashboard.ask
+    monkeypatch.setattr(Dashboard, "ask", lambda self, asked: answer if asked == question else ask(self, asked))
+    with pytest.raises(UserError, match=message):
+        make_robot(controller, tmp_path).connect()
+    assert controller.robot.runtime == Runtime.STOPPED
 
 
 def test_a_missing_client_names_the_extra(controller, tmp_path, monkeypatch):
