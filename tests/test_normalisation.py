@@ -1,5 +1,6 @@
 """Training, fine-tuning and loading: the right statistics reach LeRobot's normalisers, or a line says why not."""
 
+import contextlib
 import json
 import runpy
 import shutil
@@ -16,7 +17,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file, save_file
 
-from lerobot_uca.data import batched_dataset
+from lerobot_uca.data import batched_dataset, chosen_episodes
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.deploy.export import RawPolicy, export
 from lerobot_uca.deploy.onnx_runner import OnnxPolicy
@@ -255,6 +256,16 @@ def test_invalid_points_count_nowhere(tmp_path, shape, is_batched, monkeypatch):
         np.testing.assert_allclose(saved(trained)[f"{OBS_POINT_CLOUD}.{name}"], of(xyz, axis=(0, 1)), rtol=1e-4)
     policy, pre, _ = load(trained)
     assert policy.select_action(pre(LeRobotDataset("test/random", root=tmp_path / "data")[0])).isfinite().all()
+
+
+def test_a_streamed_dataset_says_that_its_invalid_points_count(tmp_path, caplog, monkeypatch):
+    of_mask = {"dtype": "bool", "shape": (N_POINTS,), "names": None}
+    write_dataset(tmp_path / "data", features={**features(), f"{OBS_POINT_CLOUD}.valid_mask": of_mask})
+    monkeypatch.setattr(chosen_episodes.logger, "handlers", [caplog.handler])  # LeRobot takes the root's away
+    monkeypatch.setattr(lerobot_train, "cycle", lambda loader: iter(()), raising=False)
+    with contextlib.suppress(StopIteration):
+        train(tmp_path / "data", tmp_path / "new", dataset={"streaming": True})
+    assert f"The dataset is streamed: invalid points of '{OBS_POINT_CLOUD}' count in its normalisation." in caplog.text
 
 
 def test_invalid_points_count_nowhere_in_sampled_clouds(tmp_path):

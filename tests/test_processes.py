@@ -64,6 +64,17 @@ def test_a_command_whose_reader_ends_ends_without_a_line(unbuffered, code):
     assert (process.returncode, err) == (code, "")
 
 
+@pytest.mark.parametrize("stdout", ["sys.stdout = None", "sys.stdout.close()", "sys.stdout = io.StringIO()"])
+def test_a_command_without_standard_output_ends_as_ever(stdout):
+    lines = f"import io, sys; from lerobot_uca.processes import end_by_signals; end_by_signals(); {stdout}"
+    result = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")
+    result = subprocess.run(
+        [sys.executable, "-c", f"{lines}; raise BrokenPipeError"], capture_output=True, text=True, check=False
+    )
+    assert (result.returncode, result.stderr.count("Traceback")) == (1, 1)
+
+
 def test_another_broken_pipe_is_told():
     lines = (
         "from lerobot_uca.processes import end_by_signals; end_by_signals()\n"

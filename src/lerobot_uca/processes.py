@@ -71,7 +71,8 @@ def _end(number: int, _: FrameType | None) -> None:
 def _hand_on() -> None:
     """Hand on what has been printed, as Python does at its end, but drop it if nobody reads it."""
     try:
-        sys.stdout.flush()
+        if sys.stdout is not None and not sys.stdout.closed:
+            sys.stdout.flush()
     except BrokenPipeError:
         _drop_output()
 
@@ -84,7 +85,10 @@ def _nobody_reads() -> bool:
     if not hasattr(select, "poll"):  # Windows
         return False
     poll = select.poll()
-    poll.register(sys.stdout, 0)  # a pipe without a reader is told in any case
+    try:
+        poll.register(sys.stdout, 0)  # a pipe without a reader is told in any case
+    except (TypeError, ValueError, OSError):  # there is no standard output, or it is not a file
+        return False
     return bool(poll.poll(0))
 
 

@@ -387,6 +387,8 @@ def test_training_from_depth_reads_the_datasets_own_calibration(seen, tmp_path, 
     np.testing.assert_allclose(recipe.sources[0].calibration.camera.position, camera.position, atol=1e-6)
     with pytest.raises(UserError, match="holds the calibration of camera 'front', which lerobot-train and"):
         policy_config().depth.settle(dataset.meta.features)  # from features alone
+    half = {key: value for key, value in dataset.meta.features.items() if "intrinsics" not in key}
+    assert policy_config().depth.settle(half).sources[0].calibration == other
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ def test_the_crop_is_written_into_a_training_configuration(tmp_path):
         "policy": {"depth": {"crop_low": list(CROP.low), "crop_high": list(CROP.high)}},
         "batch_size": 64,
     }
-    commented = "batch_size: 64 # as in the paper\n"
+    commented = "batch_size: 64 # as in the paper\njob_name: 'run #3'\n"
     file.write_text(commented)
     assert write_crop(file, CROP) == tmp_path / "mine.yaml.old"
     assert write_crop(file, CROP) is None

@@ -3,6 +3,7 @@
 `masks` are the features to look at and, for each, the feature that says which of its points are valid, if there is one.
 """
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -10,11 +11,14 @@ import numpy as np
 import pyarrow.dataset
 import torch
 from lerobot.datasets.compute_stats import RunningQuantileStats, aggregate_feature_stats
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_uca.data.batched_dataset import BatchedDataset, Columns
 from lerobot_uca.errors import UserError
+
+logger = logging.getLogger(__name__)
 
 MAX_LISTED = 30
 """Episodes that an error message lists."""
@@ -36,7 +40,9 @@ def chosen_statistics(dataset: Any, masks: Masks) -> Statistics:
         grouped = {key: [each[key] for each in of_episodes if key in each] for key in masks}
         stats = {key: aggregate_feature_stats(each) for key, each in grouped.items() if each}
     for key, mask in masks.items():
-        if mask is not None and key in stats:
+        if mask is not None and key in stats and _is_streamed(dataset):
+            logger.warning("The dataset is streamed: invalid points of '%s' count in its normalisation.", key)
+        elif mask is not None and key in stats:
             running = RunningQuantileStats()
             for rows in _rows(dataset, key, mask):
                 running.update(rows.values[rows.valid].double().numpy())
@@ -47,14 +53,18 @@ def chosen_statistics(dataset: Any, masks: Masks) -> Statistics:
 def check_finite(dataset: Any, masks: Masks) -> None:
     """Raise a `UserError` that names episode and frame if a value of the chosen episodes is NaN or infinite.
 
-    A cloud without valid points is refused, too. A feature without a mask of a dataset that is not read in batches is
-    checked by its statistics, and its rows only to name the frame.
+    A cloud without valid points is refused, too. A feature without a mask of a dataset that is not read in batches, and
+    all of one that is streamed, is checked by its statistics, and its rows only to name the frame.
     """
     for key, mask in masks.items():
-        if mask is None and _columns(dataset) is None:
+        if _is_streamed(dataset) or (mask is None and _columns(dataset) is None):
             _check_statistics(dataset, key)
         else:
             _check_rows(dataset, key, mask)
+
+
+def _is_streamed(dataset: Any) -> bool:
+    return not isinstance(dataset, LeRobotDataset)
 
 
 class _Rows(NamedTuple):

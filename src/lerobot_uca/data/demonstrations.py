@@ -52,7 +52,8 @@ def demonstrations(
 ) -> Generator[Demonstration]:
     """Episodes of the attempts in order, until n_wanted were successful or the attempts are used up.
 
-    One process a core that this one may use runs them, each as `demonstrate` does.
+    One process a core that this one may use runs them, each as `demonstrate` does, but no more than there are episodes
+    wanted: each takes some 300 MB.
     """
     n_workers = max(1, min(n_cores(), n_wanted))
     pending: deque[Future[Demonstration]] = deque()

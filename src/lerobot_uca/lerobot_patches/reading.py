@@ -12,6 +12,7 @@ import yaml
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import factory
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STATE
 from tqdm import tqdm
 
@@ -22,7 +23,8 @@ from lerobot_uca.data.recorded_calibrations import recorded_calibrations
 from lerobot_uca.errors import UserError, reported
 from lerobot_uca.features import cloud_observation, find_point_cloud, valid_mask
 from lerobot_uca.lerobot_patches.replacing import replace
-from lerobot_uca.point_clouds.calibration import CalibrationError
+from lerobot_uca.point_clouds.calibration import Calibration, CalibrationError
+from lerobot_uca.point_clouds.recipe import camera_of
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_base import PointCloudProcessorStep
 
@@ -77,13 +79,15 @@ def normalise_what_is_trained() -> None:
 def _begin(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:
     """Tell the policy whether this is a new training, and which calibrations depth images bring along."""
     policy.is_new_training = not config.resume
-    recorded = {}
-    is_read = hasattr(dataset, "hf_dataset") and find_point_cloud(dataset.meta.features) is None  # not streamed
-    if is_read and not (policy.depth.calibration or config.resume):
+    recorded: dict[str, Calibration] = {}
+    names = {key: config.rename_map.get(key, key) for key in dataset.meta.features}
+    is_depth = isinstance(dataset, LeRobotDataset) and find_point_cloud(names.values()) is None  # and is not streamed
+    if is_depth and not (policy.depth.calibration or config.resume):
         try:
-            recorded = recorded_calibrations(dataset)
+            by_camera = recorded_calibrations(dataset)
         except CalibrationError as error:
             raise UserError(str(error)) from error
+        recorded = {camera_of(names[key]): by_camera[camera_of(key)] for key in names if camera_of(key) in by_camera}
     policy.depth.know_calibrations(recorded, is_resumed=config.resume)
 
 

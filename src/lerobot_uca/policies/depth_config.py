@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import EXTRINSICS, OBS_POINT_CLOUD, find_point_cloud
+from lerobot_uca.features import EXTRINSICS, INTRINSICS, OBS_POINT_CLOUD, find_point_cloud
 from lerobot_uca.point_clouds.calibration import Calibration, CalibrationError
 from lerobot_uca.point_clouds.recipe import (
     RECIPE_INFO,
@@ -113,7 +113,9 @@ class DepthConfig:
             return installed_calibrations(self.calibration) or {}
         if cameras <= self._of_data.keys():
             return self._of_data
-        unread = [name for name in cameras - self._of_data.keys() if EXTRINSICS + name in features]
+        unread = [
+            name for name in cameras - self._of_data.keys() if {INTRINSICS + name, EXTRINSICS + name} <= features.keys()
+        ]
         if unread:
             raise CalibrationError(
                 f"The dataset holds the calibration of camera '{unread[0]}', which lerobot-train and "

@@ -240,7 +240,8 @@ def run(config: CalibrateConfig) -> None:
 def _set_aside(folder: Path, replaced: Calibration) -> None:
     """A camera's name stands for one device: the file of the one before is no calibration any longer."""
     for file in folder.glob("*.yaml"):
-        if str(yaml.safe_load(file.read_text(encoding="utf-8"))["serial"]) == replaced.serial:
+        values = yaml.safe_load(file.read_text(encoding="utf-8"))
+        if (str(values["serial"]), str(values["camera"])) == (replaced.serial, replaced.camera.name):
             aside = file.rename(file.with_name(f"{file.name}.old"))
             logger.warning(
                 "Camera '%s' was the device %s: its file is %s now.", replaced.camera.name, replaced.serial, aside

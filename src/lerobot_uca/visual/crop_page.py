@@ -110,11 +110,12 @@ def write_crop(file: Path, crop: Crop) -> Path | None:
         settings = yaml.safe_load(text)
     except (OSError, yaml.YAMLError) as error:
         raise UserError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from error
+    has_comments = "#" in text and yaml.safe_dump(settings, sort_keys=False) != text
     settings = _options(settings, f"'{file}'")
     policy = settings["policy"] = _options(settings.get("policy"), f"policy in '{file}'")
     depth = policy["depth"] = _options(policy.get("depth"), f"policy.depth in '{file}'")
     depth["crop_low"], depth["crop_high"] = list(crop.low), list(crop.high)
-    before = file.with_name(f"{file.name}.old") if "#" in text else None
+    before = file.with_name(f"{file.name}.old") if has_comments else None
     try:
         for target, content in ((before, text), (file, yaml.safe_dump(settings, sort_keys=False))):
             if target is not None:

@@ -129,7 +129,7 @@ class LeRobotSource(Source):
         return self._make.seen([item[key].numpy() for key in self.depth_recipe.keys])
 
     def left_out(self) -> list[str]:
-        """Features that are neither state, action nor what the new clouds are made of."""
+        """Features that are neither state, action nor what the new clouds are made of, and a recipe that is lost."""
         kept = {STATE, ACTION}
         if self.depth_recipe is None:
             mask_key = valid_mask(self._cloud_key or "", self.features)

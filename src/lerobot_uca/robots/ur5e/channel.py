@@ -31,6 +31,7 @@ class Target:
 
     q: tuple[float, ...]  # (6,) [rad]
     duration: float  # [s]
+    begins: bool = False  # a motion: an arm that stands still takes no other, which was sent before it was known to
 
 
 @dataclass(frozen=True)

@@ -170,6 +170,8 @@ class ServoLoop:
         if q.shape != (6,) or not np.isfinite(q).all() or not target.duration > 0:
             raise ArmStoppedError(f"A target has six finite angles and a positive duration, got {target}.")
         if not self._is_servoing:
+            if not target.begins:
+                return
             self._interpolator.reset(np.array(self._receive.getActualQ()))
             self._is_servoing = True
         self._interpolator.set_target(q, target.duration)

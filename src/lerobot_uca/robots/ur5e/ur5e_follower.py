@@ -268,7 +268,7 @@ class UR5eFollower(Robot):
             logger.warning("The first target is %.2f rad away (%s): easing there in %.0f s.", distance, joint, seconds)
         for step in range(1, n_steps + 1):
             self._arm.state()  # raises where the arm has stopped
-            self._arm.send(Target(tuple((start + step / n_steps * (target - start)).tolist()), period))
+            self._arm.send(Target(tuple((start + step / n_steps * (target - start)).tolist()), period, begins=True))
             time.sleep(period)
 
         settled_at = math.inf
@@ -322,7 +322,7 @@ class ClippingReport:
 
     def __init__(self, every: float = 1.0) -> None:
         self._every = every
-        self._due = -math.inf
+        self._due = self._gripper_due = -math.inf
         self._largest = np.zeros(6)
         self._n = 0
 
@@ -345,9 +345,9 @@ class ClippingReport:
 
     def note_gripper(self, position: float) -> None:
         """A gripper's position, which may lie outside 0 to 1."""
-        if not -NOTICEABLE_SHARE <= position <= 1 + NOTICEABLE_SHARE and time.monotonic() >= self._due:
+        if not -NOTICEABLE_SHARE <= position <= 1 + NOTICEABLE_SHARE and time.monotonic() >= self._gripper_due:
             logger.warning("The gripper's position %.2f was clipped to 0 (open) to 1 (closed).", position)
-            self._due = time.monotonic() + self._every
+            self._gripper_due = time.monotonic() + self._every
 
     def note_unreachable(self, pose: Array) -> None:
         """A pose that the arm cannot take."""
