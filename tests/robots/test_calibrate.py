@@ -14,8 +14,8 @@ from lerobot_uca.point_clouds.calibration import CalibrationError, pose_differen
 from lerobot_uca.robots import calibrate as command
 from lerobot_uca.robots.calibrate import BoardConfig, CalibrateConfig, calibrate
 
-INTRINSICS = (640.0, 480.0, 605.0, 560.0, 321.0, 243.0)
-K = np.array([[605.0, 0, 321], [0, 560, 243], [0, 0, 1]])
+INTRINSICS = (640.0, 480.0, 605.0, 604.0, 321.0, 243.0)
+K = np.array([[605.0, 0, 321], [0, 604, 243], [0, 0, 1]])
 BOARD = BoardConfig()
 
 
@@ -39,7 +39,7 @@ def write_csv(file, names, rows):
         writer.writerows(rows)
 
 
-def write_points(file, *, pixels, noise=0.001, n_points=12):
+def write_points(file, *, pixels, noise=0.001, n_points=12, K=K):
     rng = np.random.default_rng(0)
     seen = rng.uniform([-0.3, -0.2, 0.6], [0.3, 0.2, 1.0], (n_points, 3))
     base = seen @ X_BASE_CAMERA[:3, :3].T + X_BASE_CAMERA[:3, 3]
@@ -55,7 +55,10 @@ def write_points(file, *, pixels, noise=0.001, n_points=12):
 
 @pytest.mark.parametrize("pixels", [False, True])
 def test_touched_points(tmp_path, pixels):
-    calibration, fit = calibrate(settings(points=write_points(tmp_path / "touched.csv", pixels=pixels)))
+    points = write_points(
+        tmp_path / "touched.csv", pixels=pixels, K=np.array([[605.0, 0, 321], [0, 560, 243], [0, 0, 1]])
+    )
+    calibration, fit = calibrate(settings(points=points, intrinsics=(640.0, 480.0, 605.0, 560.0, 321.0, 243.0)))
     mm, deg = pose_difference(calibration.camera.X_world_camera, X_BASE_CAMERA)
     assert mm < 5  # at the camera, 0.8 m from the points
     assert deg < 0.3
@@ -121,7 +124,7 @@ def run(monkeypatch, *arguments):
 
 def test_the_command_writes_a_file_and_tells_what_changed(tmp_path, monkeypatch, capsys):
     points = write_points(tmp_path / "touched.csv", pixels=False)
-    arguments = ["--camera=front", "--serial=123456", "--intrinsics=[640,480,605,560,321,243]", f"--points={points}"]
+    arguments = ["--camera=front", "--serial=123456", "--intrinsics=[640,480,605,604,321,243]", f"--points={points}"]
     run(monkeypatch, *arguments, f"--folder={tmp_path / 'cameras'}")
     first = capsys.readouterr().out
     assert "Residual " in first
@@ -138,7 +141,7 @@ def test_the_command_writes_a_file_and_tells_what_changed(tmp_path, monkeypatch,
 def test_a_camera_that_is_replaced(tmp_path, monkeypatch, caplog):
     """Its name stands for the new device, and the old one's file stays to be looked at."""
     folder, points = tmp_path / "cameras", write_points(tmp_path / "touched.csv", pixels=False)
-    options = ["--intrinsics=[640,480,605,560,321,243]", f"--folder={folder}"]
+    options = ["--intrinsics=[640,480,605,604,321,243]", f"--folder={folder}"]
     for camera, serial in (("front", "111"), ("side", "333"), ("front", "222")):
         run(monkeypatch, f"--camera={camera}", f"--serial={serial}", *options, f"--points={points}")
     assert {name: each.serial for name, each in read_calibrations(folder).items()} == {"front": "222", "side": "333"}
@@ -209,6 +212,6 @@ def test_wrong_input_is_one_line(tmp_path):
 def test_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
     points = write_points(tmp_path / "touched.csv", pixels=False)
     (tmp_path / "file").touch()
-    options = ["--camera=front", "--serial=123456", "--intrinsics=[640,480,605,560,321,243]", f"--points={points}"]
+    options = ["--camera=front", "--serial=123456", "--intrinsics=[640,480,605,604,321,243]", f"--points={points}"]
     with pytest.raises(UserError, match=r"--folder '.*file' cannot be written"):
         run(monkeypatch, *options, f"--folder={tmp_path / 'file'}")

@@ -5,13 +5,14 @@ each frame. The world is taken for the robot's base frame.
 """
 
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.features import EXTRINSICS, INTRINSICS
-from lerobot_uca.point_clouds.calibration import Calibration, pose_difference
+from lerobot_uca.features import EXTRINSICS, INTRINSICS, find_point_cloud
+from lerobot_uca.point_clouds.calibration import Calibration, CalibrationError, pose_difference
 from lerobot_uca.point_clouds.recipe import camera_of, depth_keys
 
 logger = logging.getLogger(__name__)
@@ -38,6 +39,22 @@ def recorded_calibrations(dataset: Any) -> dict[str, Calibration]:
             ", ".join(found),
         )
     return found
+
+
+def calibrations_of_depth(dataset: Any, rename_map: Mapping[str, str]) -> dict[str, Calibration]:
+    """The same for a training, under the names that the policy sees; none if it sees a cloud.
+
+    Raises:
+        UserError: as `recorded_calibrations`, and if a calibration cannot be right.
+    """
+    names = {key: rename_map.get(key, key) for key in dataset.features}
+    if find_point_cloud(names.values()) is not None:
+        return {}
+    try:
+        recorded = recorded_calibrations(dataset)
+    except CalibrationError as error:
+        raise UserError(str(error)) from error
+    return {camera_of(name): recorded[camera_of(key)] for key, name in names.items() if camera_of(key) in recorded}
 
 
 def _calibration(dataset: Any, name: str, shape: tuple[int, ...]) -> Calibration:

@@ -19,12 +19,10 @@ from tqdm import tqdm
 from lerobot_uca import configs
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.chosen_episodes import check_finite, chosen_statistics
-from lerobot_uca.data.recorded_calibrations import recorded_calibrations
-from lerobot_uca.errors import UserError, reported
+from lerobot_uca.data.recorded_calibrations import calibrations_of_depth
+from lerobot_uca.errors import reported
 from lerobot_uca.features import cloud_observation, find_point_cloud, valid_mask
 from lerobot_uca.lerobot_patches.replacing import replace
-from lerobot_uca.point_clouds.calibration import Calibration, CalibrationError
-from lerobot_uca.point_clouds.recipe import camera_of
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_base import PointCloudProcessorStep
 
@@ -79,15 +77,8 @@ def normalise_what_is_trained() -> None:
 def _begin(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:
     """Tell the policy whether this is a new training, and which calibrations depth images bring along."""
     policy.is_new_training = not config.resume
-    recorded: dict[str, Calibration] = {}
-    names = {key: config.rename_map.get(key, key) for key in dataset.meta.features}
-    is_depth = isinstance(dataset, LeRobotDataset) and find_point_cloud(names.values()) is None  # and is not streamed
-    if is_depth and not (policy.depth.calibration or config.resume):
-        try:
-            by_camera = recorded_calibrations(dataset)
-        except CalibrationError as error:
-            raise UserError(str(error)) from error
-        recorded = {camera_of(names[key]): by_camera[camera_of(key)] for key in names if camera_of(key) in by_camera}
+    is_needed = isinstance(dataset, LeRobotDataset) and not (policy.depth.calibration or config.resume)  # not streamed
+    recorded = calibrations_of_depth(dataset, config.rename_map) if is_needed else {}
     policy.depth.know_calibrations(recorded, is_resumed=config.resume)
 
 
