@@ -26,6 +26,12 @@ VARIANTS = {
     "adaln": ("uca_flow", {"conditioning": "adaln"}),
     "without dual pass": ("uca_flow", {"dual_pass": False}),
 }
+
+
+def mapping(state: str, action: str) -> dict[str, NormalizationMode]:
+    return {"STATE": NormalizationMode(state), "ACTION": NormalizationMode(action)}
+
+
 every_policy = pytest.mark.parametrize("variant", VARIANTS)
 
 
@@ -174,8 +180,13 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
         ("simple_dp3", {"n_inference_steps": 101}, "must be at least 2 and divide n_training_steps = 100, got 101"),
         ("dp3", {"n_inference_steps": 51}, "must be at least 2 and divide n_training_steps = 100, got 51"),
         ("dp3", {"n_inference_steps": 1}, "must be at least 2 and divide n_training_steps = 100, got 1"),
-        ("dp3", {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}}, "ACTION: MIN_MAX .* got MEAN_STD"),
-        ("simple_dp3", {"normalization_mapping": {}}, "for 'simple_dp3', .* got IDENTITY"),
+        ("dp3", {"normalization_mapping": mapping("MIN_MAX", "MEAN_STD")}, "ACTION: MIN_MAX .* got MEAN_STD"),
+        ("simple_dp3", {"normalization_mapping": mapping("MIN_MAX", "IDENTITY")}, "for 'simple_dp3', .* got IDENTITY"),
+        (
+            "uca_flow",
+            {"normalization_mapping": {"STATE": NormalizationMode.MIN_MAX}},
+            "must name STATE .* and ACTION, got",
+        ),
         ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be one of eager, openvino, "),
         ("flowpolicy", {"delta": 0.0}, "policy.delta must be above 0, got 0.0"),
         ("flowpolicy", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),

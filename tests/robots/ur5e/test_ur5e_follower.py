@@ -161,7 +161,8 @@ def test_the_way_to_the_first_action_is_as_slow_as_the_arm_may_be(controller, tm
 
 
 EASING = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs these tests may ignore it
 from pathlib import Path
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
 from lerobot_uca.robots.ur5e.ur5e_follower import JOINT_KEYS, UR5eFollower
@@ -459,7 +460,8 @@ def test_disconnecting_stops_a_moving_arm_and_frees_it(controller, robot, tmp_pa
 
 
 PARENT = """
-import os, sys, time
+import os, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from lerobot_uca.robots.ur5e.channel import Settings, Target
 from lerobot_uca.robots.ur5e.limits import JointLimits
 from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
@@ -510,7 +512,7 @@ BAD_ACTIONS = {
     "nan": ({JOINT_KEYS[1]: math.nan}, "finite numbers, got others for shoulder_lift.pos"),
     "infinite": ({GRIPPER_KEY: math.inf}, "got others for gripper.pos"),
     "degrees": ({JOINT_KEYS[0]: 90.0}, "radians.*got 90.0. Degrees?"),
-    "percent": ({GRIPPER_KEY: 5.0}, r"in 0 .open. to 1 .closed., got 5. Another scale?"),
+    "percent": ({GRIPPER_KEY: 60.0}, r"in 0 .open. to 1 .closed., got 60. Another scale?"),
     "nothing": ({JOINT_KEYS[0]: None}, "values are numbers, one for each name"),
     "two numbers": ({JOINT_KEYS[0]: np.zeros(2)}, "values are numbers, one for each name"),
     "another robot": ({"elbow_flex.pos": 0.0}, "unknown: elbow_flex.pos"),

@@ -39,9 +39,12 @@ GRIPPER_KEY = "gripper.pos"
 ARM_TELLS_WITHIN = 0.2
 """[s] An emergency stop takes the gripper's power, too; where that is noticed first, the arm's reason follows."""
 
+STOP_COMES_WITHIN = 3.0
+"""[s] The longest step of a control_rate, and a busy computer's pause."""
+
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
 MEANT_IN_METRES = 2.0  # the arm reaches 0.85 m
-GRIPPER_RANGE = (-0.5, 1.5)  # what may be meant as 0 to 1
+GRIPPER_RANGE = (-10.0, 10.0)  # a policy that has hardly been trained may leave 0 to 1; percents go farther
 ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
 SETTLING = 0.4  # [s], after which an arm whose setpoint is at the first target is as near as it gets
 NOTICEABLE_SHARE = 0.02  # of the gripper's range
@@ -65,6 +68,7 @@ class UR5eFollower(Robot):
         self._gripper: RobotiqGripper | None = None
         self._previous: Array = np.zeros(6)  # the last target [rad]
         self._sent_at = 0.0
+        self._last_target_at = 0.0
         self._tcp_near: Array = np.zeros(6)
         self._clipping = ClippingReport()
 
@@ -177,6 +181,9 @@ class UR5eFollower(Robot):
             values = self._checked(action)
         except UserError as error:
             raise self._stopped(f"{error} The arm was stopped.") from None
+        if state.is_servoing and state.has_arrived and self._is_stop_due:
+            # A target for a moving arm would be left out, if the arm stops before it comes.
+            state = self._arm.wait_for(lambda state: not state.is_servoing, STOP_COMES_WITHIN, "The arm's stop")
         if not state.is_servoing:
             self._previous = np.array(state.q)
         wanted = self._joint_target(values[:6], state)
@@ -184,7 +191,7 @@ class UR5eFollower(Robot):
             elapsed = min(time.monotonic() - self._sent_at, self.config.stop_after)
             target = clip_target(wanted, self._previous, self.config.limits, max(elapsed, 1 / self.config.control_rate))
             self._clipping.note(wanted - target)
-            self._arm.send(Target(tuple(target.tolist()), 1 / self.config.control_rate))
+            self._send(target, begins=False)
         else:
             target = np.clip(wanted, self.config.lower, self.config.upper)
             self._clipping.note(wanted - target)
@@ -195,6 +202,16 @@ class UR5eFollower(Robot):
         commanded_gripper = [] if self._gripper is None else [self._gripper.request(values[6])]
         commanded = target if self.config.action == "joints" else self._tcp_at(target, state)
         return dict(zip(self._keys, [*commanded.tolist(), *commanded_gripper], strict=True))
+
+    def _send(self, target: Array, *, begins: bool) -> None:
+        assert self._arm is not None
+        self._last_target_at = time.monotonic()
+        self._arm.send(Target(tuple(target.tolist()), 1 / self.config.control_rate, begins))
+
+    @property
+    def _is_stop_due(self) -> bool:
+        """Whether the arm may have stopped since its last state, for want of actions."""
+        return time.monotonic() - self._last_target_at >= self.config.stop_after
 
     def _stopped(self, reason: str) -> ArmStoppedError:
         """Stop the arm, and the error that says why; whatever is asked afterwards raises it, too."""
@@ -268,7 +285,7 @@ class UR5eFollower(Robot):
             logger.warning("The first target is %.2f rad away (%s): easing there in %.0f s.", distance, joint, seconds)
         for step in range(1, n_steps + 1):
             self._arm.state()  # raises where the arm has stopped
-            self._arm.send(Target(tuple((start + step / n_steps * (target - start)).tolist()), period, begins=True))
+            self._send(start + step / n_steps * (target - start), begins=True)
             time.sleep(period)
 
         settled_at = math.inf
