@@ -107,10 +107,10 @@ class RtdeProcess:
         Raises `ArmStoppedError` where the arm has stopped or nothing has been heard for a while.
         """
         with self._changed:
-            is_told = self._changed.wait_for(lambda: self._failure or self._age < FRESH, HEARTBEAT_TIMEOUT)
+            is_fresh = self._changed.wait_for(lambda: self._failure or self._age < FRESH, HEARTBEAT_TIMEOUT)
             self._raise_failure()
             assert self._state is not None  # the constructor waits for one
-            if is_told:
+            if is_fresh:
                 return self._state
             # Whoever asks from now on is told this, not that the process was killed.
             self._failure = f"The process that talks to the arm has not been heard for {self._age:.1f} s and was ended."

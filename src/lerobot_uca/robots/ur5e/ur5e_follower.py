@@ -68,7 +68,6 @@ class UR5eFollower(Robot):
         self._gripper: RobotiqGripper | None = None
         self._previous: Array = np.zeros(6)  # the last target [rad]
         self._sent_at = 0.0
-        self._last_target_at = 0.0
         self._tcp_near: Array = np.zeros(6)
         self._clipping = ClippingReport()
 
@@ -196,7 +195,7 @@ class UR5eFollower(Robot):
             target = np.clip(wanted, self.config.lower, self.config.upper)
             self._clipping.note(wanted - target)
             self._ease(target)
-        self._previous, self._sent_at = target, time.monotonic()
+        self._previous = target
         if self._gripper is not None:
             self._clipping.note_gripper(values[6])
         commanded_gripper = [] if self._gripper is None else [self._gripper.request(values[6])]
@@ -205,13 +204,13 @@ class UR5eFollower(Robot):
 
     def _send(self, target: Array, *, begins: bool) -> None:
         assert self._arm is not None
-        self._last_target_at = time.monotonic()
+        self._sent_at = time.monotonic()
         self._arm.send(Target(tuple(target.tolist()), 1 / self.config.control_rate, begins))
 
     @property
     def _is_stop_due(self) -> bool:
         """Whether the arm may have stopped since its last state, for want of actions."""
-        return time.monotonic() - self._last_target_at >= self.config.stop_after
+        return time.monotonic() - self._sent_at >= self.config.stop_after
 
     def _stopped(self, reason: str) -> ArmStoppedError:
         """Stop the arm, and the error that says why; whatever is asked afterwards raises it, too."""
