@@ -42,7 +42,7 @@ def main() -> None:
         **{policy: {"unet_widths": tuple(args.widths)} for policy in ("dp3", "flowpolicy", "mp1")},
         "simple_dp3": {"unet_widths": SIMPLE_DP3},
     }
-    write_rows(row(policy, size, args) for policy, size in sizes.items())
+    write_rows((row(policy, size, args) for policy, size in sizes.items()), device=args.device)
 
 
 def row(policy_type: str, sizes: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:

@@ -90,24 +90,24 @@ def reading_bandwidth(device: str = "cpu", n_megabytes: int = 256) -> float:
 # Provenance -------------------------------------------------------------------------------------------------------
 
 
-def provenance() -> dict[str, str]:
+def provenance(device: str = "cpu") -> dict[str, str]:
     """How this run's rows were made: `COLUMNS`."""
     script = Path(sys.argv[0])
     name = script.resolve().relative_to(ROOT) if script.resolve().is_relative_to(ROOT) else Path(script.name)
     threads = [f"{OMP}={os.environ[OMP]}"] if OMP in os.environ else []
-    return columns(shlex.join([*threads, "python", str(name), *sys.argv[1:]]))
+    return columns(shlex.join([*threads, "python", str(name), *sys.argv[1:]]), device)
 
 
-def print_provenance() -> None:
+def print_provenance(device: str = "cpu") -> None:
     """The same as the first lines of a text result."""
-    for name, value in provenance().items():
+    for name, value in provenance(device).items():
         print(f"# {name}: {value}")
     print()
 
 
-def write_rows(rows: Iterable[dict[str, Any]], file: TextIO = sys.stdout) -> None:
+def write_rows(rows: Iterable[dict[str, Any]], file: TextIO = sys.stdout, device: str = "cpu") -> None:
     """Write rows as CSV, each as soon as it is measured, with how it was made."""
-    made, writer = provenance(), None
+    made, writer = provenance(device), None
     for row in rows:
         if writer is None:
             writer = csv.DictWriter(file, [*row, *COLUMNS], lineterminator="\n")

@@ -43,7 +43,7 @@ def main() -> None:
     peak, bandwidth = matrix_product_peak(device=args.device), reading_bandwidth(args.device)
     machine = f"{args.device}, {torch.get_num_threads()} threads, {peak / 1e9:.0f} GFLOP/s, {bandwidth / 1e9:.1f} GB/s"
     print(f"{machine}; times in ms, medians", file=sys.stderr)
-    write_rows(rows(args, peak, bandwidth))
+    write_rows(rows(args, peak, bandwidth), device=args.device)
 
 
 def rows(args: argparse.Namespace, peak: float, bandwidth: float) -> Iterator[dict[str, Any]]:

@@ -61,7 +61,7 @@ def main() -> None:
         rows.append([encode, whole - encode, backward, step, whole + backward + step])
     stages = np.median(rows[2:], axis=0)
     peak = matrix_product_peak(dtype, args.device)
-    print_provenance()
+    print_provenance(args.device)
     print(f"batch {args.batch_size}, dim {args.dim}, {args.n_points} points, {args.dtype} on {args.device}, ", end="")
     print(f"{torch.get_num_threads()} threads; median of {args.steps} steps")
     names = ("encoder, forward", "two passes and JVP, forward", "backward", "optimiser and moving average", "step")

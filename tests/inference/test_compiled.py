@@ -1,6 +1,9 @@
 """Beyond what is tested with whole policies."""
 
+import threading
+
 import torch
+from tests.fake_cuda import moved
 from torch import nn
 
 from lerobot_uca.inference.compiled import CompiledFunction
@@ -30,3 +33,27 @@ def test_results_are_not_overwritten_by_the_next_call():
     (first,) = function(network, x)
     x.fill_(1)  # as a CUDA graph does with what it returned
     assert torch.equal(first, torch.zeros(2))
+
+
+def test_cuda_graphs_belong_to_one_thread(monkeypatch, caplog):
+    monkeypatch.setattr(CompiledFunction, "_are_graphs_taken", False)
+    monkeypatch.setattr(CompiledFunction, "_of_thread", threading.local())
+    function, compiled_in = CompiledFunction(call), []
+
+    def compiled(*arguments):  # stands for what a GPU would record
+        compiled_in.append(threading.current_thread().name)
+        assert not torch.is_inference_mode_enabled()
+        return call(*arguments)
+
+    function._compiled = compiled
+    x, results = moved(torch.ones(2)), []
+    network = nn.Identity().eval()
+    with torch.inference_mode():
+        results += function(network, x)
+    other = threading.Thread(target=lambda: results.extend(function(network, x) + function(network, x)), name="other")
+    other.start()
+    other.join()
+    assert [result.tolist() for result in results] == [[1, 1]] * 3
+    assert compiled_in == ["MainThread"]
+    (line,) = caplog.messages
+    assert line.startswith("policy.inference=compile: PyTorch keeps CUDA graphs for the thread")

@@ -1,12 +1,17 @@
-"""Cells elsewhere: a real Ray cluster, and submitit without Slurm."""
+"""Cells on the GPUs of a machine, and elsewhere: a Ray cluster, and submitit without Slurm."""
+
+from pathlib import Path
 
 import pytest
+import torch
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import launchers
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.command import main
-from lerobot_uca.protocol.launchers import Ended, on_ray, on_slurm
+from lerobot_uca.protocol.folder import RunFolder
+from lerobot_uca.protocol.launchers import Ended, local, on_ray, on_slurm
+from lerobot_uca.protocol.setting import Setting
 
 CELL = Cell("metaworld/reach", "uca_flow", 0)
 
@@ -28,7 +33,7 @@ def test_slurm_without_slurm(monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--slurm=partition"], "--slurm takes options as partition=gpu,time=600, got 'partition'."),
+        (["--slurm=partition"], "--slurm takes options as partition=gpu,gres=gpu:1,time=600, got 'partition'."),
         (["--parallel=0"], "--parallel must be at least 1, got 0."),
     ],
 )
@@ -45,3 +50,51 @@ def test_submitit_runs_each_cell_in_a_task_of_its_own(tmp_path, monkeypatch):
     other = CELL._replace(seed=1)
     launch = on_slurm({"partition": "short"}, cluster="local")
     assert sorted(launch(tmp_path, [CELL, other], None)) == [Ended(CELL, 0), Ended(other, 1)]
+
+
+def make_folder(path: Path, device: str | None = None) -> RunFolder:
+    policy = {} if device is None else {"device": device}
+    values = {"description": "", "batch_size": 4, "lengths": {"metaworld": {"steps": 4, "evaluations": 2}}}
+    return RunFolder.create(path, Setting.from_values("a setting", {**values, "policy": policy}))
+
+
+@pytest.mark.parametrize(
+    ("device", "n_gpus", "places"),
+    [
+        ("cpu", 2, [None] * 3),
+        ("cuda", 0, [None] * 3),
+        ("cuda", 2, ["0", "1"]),
+        ("cuda:1", 2, [None]),
+        ("mps", 0, [None]),
+        (None, 0, [None] * 3),
+    ],
+)
+def test_cells_at_once(tmp_path, monkeypatch, device, n_gpus, places):
+    monkeypatch.setattr(launchers, "n_cores", lambda: 3)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: n_gpus)
+    monkeypatch.setattr(torch.accelerator, "current_accelerator", lambda check_available: None)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    assert launchers._places(make_folder(tmp_path / "run", device).setting) == places
+
+
+@pytest.mark.parametrize(("n_parallel", "seen"), [(None, [["4", "4", "7"], ["4", "7", "7"]]), (1, [["4"] * 3])])
+def test_each_cell_sees_one_gpu(tmp_path, monkeypatch, n_parallel, seen):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    python = tmp_path / "python"  # stands for a cell: this test is of what its process is given
+    python.write_text(f'#!/bin/sh\nsleep 0.1\necho "$CUDA_VISIBLE_DEVICES" >> {tmp_path}/seen\n')
+    python.chmod(0o755)
+    monkeypatch.setattr(launchers.sys, "executable", str(python))
+    cells = [CELL._replace(seed=seed) for seed in range(3)]
+    ends = local(n_parallel)(make_folder(tmp_path / "run", "cuda").path, cells, None)
+    assert sorted(ends) == [Ended(cell, 0) for cell in cells]
+    assert sorted((tmp_path / "seen").read_text().split()) in seen
+
+
+@pytest.mark.parametrize(("setting", "options"), [("paper", ""), ("paper", "partition=a,gres=gpu:1"), ("small", "")])
+def test_slurm_shows_gpus_to_those_who_ask(tmp_path, monkeypatch, capsys, setting, options):
+    monkeypatch.setattr("lerobot_uca.protocol.command.on_slurm", lambda options: lambda *_: iter([Ended(CELL, 2)]))
+    with pytest.raises(SystemExit):
+        main(["run", f"--output={tmp_path}/run", f"--setting={setting}", "--tasks=reach", f"--slurm={options}"])
+    is_told = "--slurm asks for none" in capsys.readouterr().out
+    assert is_told == (setting == "paper" and not options)

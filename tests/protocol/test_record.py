@@ -3,6 +3,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import torch
+
 from lerobot_uca.protocol import record
 
 
@@ -42,3 +44,13 @@ def test_a_checkout_has_its_commit(tmp_path):
     assert commit_of(file) == head
     file.write_text(file.read_text() + "# changed\n")
     assert commit_of(file) == f"{head}-dirty"
+
+
+def test_a_gpu_that_did_not_compute_is_no_hardware_of_a_result(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"the GPU {device}")
+    assert record.provenance("cpu")["hardware"]["gpu"] is None
+    assert record.provenance("cuda")["hardware"]["gpu"] == "the GPU cuda"
+    assert record.columns("a command", "cuda")["cpu"].endswith(" cores, the GPU cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)  # a cell that another machine goes on with
+    assert record.provenance("cuda")["hardware"]["gpu"] is None

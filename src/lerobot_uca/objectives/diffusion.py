@@ -42,7 +42,7 @@ def ddim_sample(
     """Actions (B, T, A) from noise in n_steps calls of the network, without further noise."""
     scheduler.set_timesteps(n_steps)
     z = noise
-    for k in scheduler.timesteps:
-        x = network(z, k.expand(len(z)).to(z.device), o)
+    for k, on_device in zip(scheduler.timesteps, scheduler.timesteps.to(z.device), strict=True):
+        x = network(z, on_device.expand(len(z)), o)
         z = scheduler.step(x, k, z, return_dict=False)[0]
     return z

@@ -72,8 +72,11 @@ def dispersive_loss(features: Tensor) -> Tensor:
     Args:
         features: (B, ...).
     """
-    flat = features.flatten(1)
-    distances = torch.cdist(flat, flat, compute_mode="donot_use_mm_for_euclid_dist").square()
+    with torch.autocast(features.device.type, enabled=False):
+        flat = features.flatten(1).to(torch.promote_types(features.dtype, torch.float32))
+        flat = flat - flat.mean(dim=0)  # which changes no distance, and leaves less to round
+        squares = flat.square().sum(dim=-1)
+        distances = (squares[:, None] + squares - 2 * flat @ flat.mT).clamp(min=0)
     return torch.exp(-distances / distances.max().clamp(min=torch.finfo(distances.dtype).tiny)).mean().log()
 
 

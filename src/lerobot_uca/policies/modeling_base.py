@@ -6,6 +6,7 @@ Letters: B samples, O observation steps, N points, S state dimensions, T horizon
 """
 
 import functools
+import math
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -151,13 +152,14 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         with independent_draws(x.device), _without_inference_mode():
             o = model.encoder(*observations)
             loss = self.compute_loss(model.generator, x, o, mask)
-        parts = {name: value.mean().item() for name, value in loss.parts.items()}
         mean = loss.total.mean()
-        if not torch.isfinite(mean):
+        # All at once: each reading of a number waits for the GPU.
+        total, *values = torch.stack([mean.detach(), *(part.mean() for part in loss.parts.values())]).tolist()
+        if not math.isfinite(total):
             observations.checked()
             inputs.check_values(ACTION, x)
             raise self._diverged()
-        return (mean if reduction == "mean" else loss.total), parts
+        return (mean if reduction == "mean" else loss.total), dict(zip(loss.parts, values, strict=True))
 
     def _mask(self, batch: Mapping[str, Tensor], x: Tensor) -> Tensor:
         """True (B, T) for the actions that count."""

@@ -119,4 +119,6 @@ def _rotations(vectors: Tensor) -> Tensor:
     x, y, z = vectors.unbind(dim=-1)
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    return torch.linalg.matrix_exp(skew)
+    angle = torch.linalg.vector_norm(vectors, dim=-1)[:, None, None]
+    sines, cosines = torch.sinc(angle / torch.pi), torch.sinc(angle / (2 * torch.pi)).square() / 2  # Rodrigues' formula
+    return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + sines * skew + cosines * (skew @ skew)

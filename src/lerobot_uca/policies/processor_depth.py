@@ -90,7 +90,7 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
         return {**rest, OBS_POINT_CLOUD: self._clouds([observation[key] for key in recipe.keys])}
 
     def _clouds(self, images: list[Any]) -> Tensor:
-        """Images (..., 1, H, W), one a camera, to clouds (..., N, 3)."""
+        """Images (..., 1, H, W), one a camera, to clouds (..., N, 3) on the device that the images are on."""
         arrays = [_as_array(image) for image in images]
         leading = arrays[0].shape[:-3]
         frames = [array.reshape(-1, *array.shape[-3:]) for array in arrays]
@@ -99,7 +99,8 @@ class DepthToCloudProcessorStep(ObservationProcessorStep):
             clouds = [self._make(views) for views in zip(*frames, strict=True)]
         except DepthError as error:
             raise UserError(str(error)) from error
-        return torch.from_numpy(np.stack(clouds).reshape(*leading, *clouds[0].shape))
+        made = torch.from_numpy(np.stack(clouds).reshape(*leading, *clouds[0].shape))
+        return made.to(images[0].device) if isinstance(images[0], Tensor) else made
 
     @override
     def get_config(self) -> dict[str, Any]:

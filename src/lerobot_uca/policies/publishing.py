@@ -100,7 +100,7 @@ def latency_ms(policy: "PointCloudPolicy") -> float:
     policy.eval()
     policy.reset()
     times = []
-    with torch.random.fork_rng():
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
         for _ in range(N_TIMED):
             start = time.perf_counter()
             policy.predict_action_chunk(observation).cpu()

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.processes import n_cores
 from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, grid, resolve_policies, resolve_tasks
+from lerobot_uca.protocol.folder import RunFolder
 from lerobot_uca.protocol.launchers import Launcher, local, on_ray, on_slurm
 from lerobot_uca.protocol.report import report
 from lerobot_uca.protocol.run import make_folder, run
@@ -20,7 +20,7 @@ Train and evaluate every policy on every task with every seed, and go on where a
 
 Each (task, policy, seed) is a cell with a folder of its own. Several processes, also on several machines that share
 the disk, may work on one output folder: each takes the cells that nobody else works on. Stop with Ctrl-C; the same
-command goes on. Every cell has one thread; as many run at once as there are cores.
+command goes on. Every cell has one thread; as many run at once as there are cores, or GPUs if they compute there.
 
 suites:   {", ".join(SUITES)}
 groups:   {", ".join(PAPER_GROUPS)}
@@ -58,7 +58,7 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         "--setting", default="small", help="small, paper, a YAML file, or a run's setting.json (default: small)"
     )
     parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
-    parser.add_argument("--parallel", type=int, default=n_cores(), help="cells at once (default: one a core)")
+    parser.add_argument("--parallel", type=int, help="cells at once (default: one a core, or one a GPU if it computes)")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster instead, at HOST:PORT or auto")
     where.add_argument(
@@ -66,26 +66,33 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         nargs="?",
         const="",
         metavar="OPTIONS",
-        help="run as a Slurm array instead; sbatch's options as partition=gpu,time=600",
+        help="run as a Slurm array instead; sbatch's options as partition=gpu,gres=gpu:1,time=600",
     )
     parser.set_defaults(do=_run)
 
 
 def _run(args: argparse.Namespace) -> None:
     cells = grid(args.suite, args.tasks, args.policies, args.seeds)
-    if not run(make_folder(args.output, args.setting), cells, _launcher(args), args.expert):
+    folder = make_folder(args.output, args.setting)
+    if not run(folder, cells, _launcher(args, folder), args.expert):
         sys.exit(1)
 
 
-def _launcher(args: argparse.Namespace) -> Launcher:
+def _launcher(args: argparse.Namespace, folder: RunFolder) -> Launcher:
     if args.ray is not None:
         return on_ray(args.ray)
     if args.slurm is not None:
         pairs = [option.partition("=") for option in args.slurm.split(",") if option]
         if not all(name and value for name, _, value in pairs):
-            raise UserError(f"--slurm takes options as partition=gpu,time=600, got '{args.slurm}'.")
+            raise UserError(f"--slurm takes options as partition=gpu,gres=gpu:1,time=600, got '{args.slurm}'.")
+        asks_for_gpu = any(name.startswith(("gres", "gpus")) for name, *_ in pairs)
+        if folder.setting.policy.get("device") != "cpu" and not asks_for_gpu:
+            folder.log(
+                f"Setting '{folder.setting.name}' computes on a GPU, but --slurm asks for none: many clusters show a "
+                "job none then, and it trains on the CPU. To ask: gres=gpu:1."
+            )
         return on_slurm({name: value for name, _, value in pairs})
-    if args.parallel < 1:
+    if args.parallel is not None and args.parallel < 1:
         raise UserError(f"--parallel must be at least 1, got {args.parallel}.")
     return local(args.parallel)
 

@@ -1,5 +1,6 @@
 """Launchers run cells. A launcher takes cells and yields the end of each, as they end."""
 
+import itertools
 import logging
 import os
 import shutil
@@ -13,10 +14,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.processes import n_cores
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import RunFolder
 from lerobot_uca.protocol.run_cell import Outcome
+from lerobot_uca.protocol.setting import Setting
 
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
 
 
@@ -44,33 +48,59 @@ def run_process(folder: Path, cell: Cell, expert: str | None) -> int:
     return _start(folder, cell, expert).wait()
 
 
-def _start(folder: Path, cell: Cell, expert: str | None) -> "subprocess.Popen[bytes]":
+def _start(folder: Path, cell: Cell, expert: str | None, gpu: str | None = None) -> "subprocess.Popen[bytes]":
     arguments = [str(folder), cell.task, cell.policy, str(cell.seed), *([expert] if expert else [])]
     command = [sys.executable, "-m", "lerobot_uca.protocol.run_cell", *arguments]
-    return subprocess.Popen(command, env={**os.environ, **ONE_THREAD})  # noqa: S603
+    chosen = {} if gpu is None else {VISIBLE_GPUS: gpu}
+    return subprocess.Popen(command, env={**os.environ, **ONE_THREAD, **chosen})  # noqa: S603
 
 
-def local(n_parallel: int) -> Launcher:
-    """Run so many cells at once on this machine. They end when the launcher is left, with Ctrl-C for example."""
+def local(n_parallel: int | None = None) -> Launcher:
+    """Run so many cells at once on this machine. They end when the launcher is left, with Ctrl-C for example.
+
+    Args:
+        n_parallel: by default one a core, or one a GPU if that is where the setting computes; they take turns in them.
+    """
 
     def launch(folder: Path, cells: Sequence[Cell], expert: str | None) -> Iterator[Ended]:
+        places = _places(RunFolder.open(folder).setting)
+        free = deque(itertools.islice(itertools.cycle(places), n_parallel or len(places)))
         waiting = deque(cells)
-        running: list[tuple[subprocess.Popen[bytes], Cell]] = []
+        running: list[tuple[subprocess.Popen[bytes], Cell, str | None]] = []
         try:
             while waiting or running:
-                while waiting and len(running) < n_parallel:
-                    cell = waiting.popleft()
-                    running.append((_start(folder, cell, expert), cell))
+                while waiting and free:
+                    cell, gpu = waiting.popleft(), free.popleft()
+                    running.append((_start(folder, cell, expert, gpu), cell, gpu))
                 time.sleep(POLL_SECONDS)
-                for process, cell in [each for each in running if each[0].poll() is not None]:
-                    running.remove((process, cell))
+                for each in [each for each in running if each[0].poll() is not None]:
+                    running.remove(each)
+                    process, cell, gpu = each
+                    free.append(gpu)
                     yield Ended(cell, process.returncode)
         finally:
-            for process, _ in running:
+            for process, *_ in running:
                 process.kill()  # and with it its training, which is tied to it
                 process.wait()
 
     return launch
+
+
+def _places(setting: Setting) -> list[str | None]:
+    """The GPU of each cell that may run at once: its name, or None where there is nothing to choose."""
+    device = setting.policy.get("device")
+    if device == "cpu":
+        return [None] * n_cores()
+    import torch
+
+    device = device or str(torch.accelerator.current_accelerator(check_available=True))
+    n_gpus = torch.cuda.device_count()
+    if device == "None" or (device == "cuda" and not n_gpus):
+        return [None] * n_cores()
+    if device != "cuda":
+        return [None]  # a single one, mps or cuda:1
+    visible = os.environ.get(VISIBLE_GPUS)
+    return [*(visible.split(",") if visible else map(str, range(n_gpus)))][:n_gpus]
 
 
 def on_ray(address: str) -> Launcher:

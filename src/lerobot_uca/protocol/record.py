@@ -16,35 +16,41 @@ COLUMNS = ("command", "commit", "versions", "cpu")
 """The last columns of a measured row."""
 
 
-def provenance() -> dict[str, Any]:
-    """Versions of packages, commit of this package and hardware, as plain values."""
+def provenance(device: str = "cpu") -> dict[str, Any]:
+    """Versions of packages, commit of this package and hardware, as plain values.
+
+    Args:
+        device: that computed; a GPU that did not has no part in the result.
+    """
     import torch
 
+    on_gpu = torch.device(device).type == "cuda" and torch.cuda.is_available()
     return {
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
         "commit": commit(),
         "hardware": {
             "cpu": _cpu(),
             "cores": n_cores(),
-            "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+            "gpu": torch.cuda.get_device_name(device) if on_gpu else None,
             "threads": torch.get_num_threads(),
         },
     }
 
 
-def columns(command: str) -> dict[str, str]:
+def columns(command: str, device: str = "cpu") -> dict[str, str]:
     """The same as a row's last columns, `COLUMNS`.
 
     Args:
         command: what was typed.
+        device: that computed; a GPU's name follows the processor's.
     """
-    made = provenance()
+    made = provenance(device)
     hardware, versions = made["hardware"], made["versions"].items()
     return {
         "command": command,
         "commit": made["commit"] or "unknown",
         "versions": ", ".join(f"{name} {version}" for name, version in versions if version),
-        "cpu": f"{hardware['cpu']}, {hardware['cores']} cores",
+        "cpu": f"{hardware['cpu']}, {hardware['cores']} cores" + (f", {hardware['gpu']}" if hardware["gpu"] else ""),
     }
 
 

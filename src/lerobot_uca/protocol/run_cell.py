@@ -157,6 +157,7 @@ def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
     files, setting = folder.cell(cell), folder.setting
     checkpoint = training.checkpoint(files, setting.length(cell).steps)
     assert checkpoint is not None
+    config = json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))  # device and precision it found there
     return {
         "cell": cell._asdict(),
         "success": sum(row.success for row in final) / len(final),
@@ -165,9 +166,8 @@ def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
         "inference": measure(checkpoint),
         "setting": setting.as_values(),
         "training_options": training.training_options(cell, setting),
-        # The last checkpoint's: the processor decides, too (policies/precision.py).
-        "dtype": json.loads((checkpoint / "config.json").read_text(encoding="utf-8"))["dtype"],
-        **provenance(),
+        "dtype": config["dtype"],  # the processor decides, too (policies/precision.py)
+        **provenance(config["device"]),
     }
 
 
