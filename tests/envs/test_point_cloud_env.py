@@ -30,6 +30,12 @@ def test_vector_environments_give_the_episodes_of_single_ones(kind, task, n_acti
         stepped, *_, info = vector.step(actions)
         assert info["is_success"].tolist() == [False, False]
         assert vector.call("render")[0].shape == (320, 320, 3)
+        for _ in range(episode_length - 1):
+            *_, truncated, _ = vector.step(actions)
+        assert truncated.tolist() == [True, True]
+        again, _ = vector.reset(seed=[5, 6])  # it is frozen for LeRobot's loop alone
+        np.testing.assert_array_equal(again["point_cloud"], observations["point_cloud"])
+        assert vector.step(actions)[3].tolist() == [False, False]
     finally:
         vector.close()
     for index, seed in enumerate((5, 6)):

@@ -44,6 +44,11 @@ def test_without_a_failure_the_interval_is_that_of_all_episodes():
     assert mean_rate([seeds(0, n_episodes=50)]) == pytest.approx(wilson(0.0, 50))
 
 
+def test_where_nothing_differs_a_difference_is_as_uncertain_as_so_many_episodes():
+    assert mean_difference([np.zeros((1, 100), int)]) == pytest.approx((0, -0.07398, 0.07398), abs=1e-5)
+    assert not mean_difference([np.ones((1, 1), int)]).is_decided  # of a single episode
+
+
 @pytest.mark.parametrize("mean", [mean_rate, mean_difference])
 def test_seeds_in_the_same_episodes_tell_nothing_of_others(mean):
     once, thrice = mean([seeds(50)]), mean([seeds(50, 50, 50)])

@@ -8,6 +8,7 @@ import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 from tests.browser import browser, needs_browser
 from tests.robots.conftest import wait_until
@@ -17,6 +18,7 @@ from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, Cell
 from lerobot_uca.protocol.command import main
 from lerobot_uca.protocol.figures import COLOURS, FIGURES
 from lerobot_uca.protocol.folder import RunFolder, write_json
+from lerobot_uca.protocol.intervals import mean_rate, wilson
 from lerobot_uca.protocol.paper import ABLATION, COLUMNS, MILLISECONDS, SUCCESS, goal
 from lerobot_uca.protocol.results import Results
 from lerobot_uca.protocol.rows import Row, write_rows
@@ -163,8 +165,11 @@ def test_latex_compiles_to_tables_on_the_page(folder, tmp_path):
 def test_wilson_for_a_task_and_milliseconds_for_a_policy(folder):
     results, corrupt = Results.read([folder.path])
     assert corrupt == []
-    expected = 0.85, 0.7672, 0.9069  # of 100 episodes, the same for both seeds
-    assert results.honest([REACH], "uca_flow") == pytest.approx(expected, abs=1e-3)
+    one = results.of(lambda cell: cell.seed == 0)
+    assert one.honest([REACH], "uca_flow") == pytest.approx(wilson(0.8, 100))
+    assert one.honest([REACH, "metaworld/door-open"], "uca_flow") == pytest.approx(wilson(0.8, 100))
+    successes = np.array([[1] * n + [0] * (100 - n) for n in (80, 90)])
+    assert results.honest([REACH], "uca_flow") == mean_rate([successes])  # of two trainings that differ
     assert results.milliseconds(results.tasks, "uca_flow") == (2.5, 0.5, 2)
     assert results.papers_rule([REACH], "uca_flow") == (pytest.approx(0.9), 0, 1)
 
@@ -213,6 +218,36 @@ def test_two_results_of_a_cell_are_not_mixed(folder, tmp_path):
         Results.read([folder.path, other.path])
 
 
+def test_two_last_checkpoints_of_a_cell_are_not_mixed(folder, tmp_path):
+    other = RunFolder.create(tmp_path / "other", SETTING)
+    cell = Cell(REACH, "uca_flow", 0)
+    add_cell(other, cell, 80)
+    rows = [row._replace(step=50) for row in make_rows(cell, 80, ()) if row.is_final]
+    write_rows(other.cell(cell).rows / "final.csv", rows)
+    with pytest.raises(UserError, match="hold different results of metaworld/reach uca_flow seed 0"):
+        Results.read([folder.path, other.path])
+
+
+def test_results_of_two_experts_are_not_mixed(folder, tmp_path):
+    other = RunFolder.create(tmp_path / "other", SETTING)
+    add_cell(other, Cell(REACH, "uca_flow", 5), 80)
+    add_cell(other, Cell(WALL, "uca_flow", 5), 80)
+    for run, expert in ((folder, "sha256:a"), (other, "sha256:b")):
+        for path in run.path.glob("cells/metaworld/reach/*/*/cell.json"):
+            write_json(path, {**json.loads(path.read_text()), "expert": expert})
+    with pytest.raises(UserError, match="metaworld/reach have learned from different experts: sha256:a, sha256:b"):
+        Results.read([folder.path, other.path])
+
+
+def test_a_record_that_is_none(folder):
+    files = folder.cell(Cell(REACH, "uca_flow", 0))
+    for text in ("{}", '{"cell": ', "[]"):
+        files.result.write_text(text)
+        assert not files.is_finished
+        with pytest.raises(UserError, match=r"cell\.json' (is not what is recorded|cannot be read)"):
+            Results.read([folder.path])
+
+
 def test_what_a_killed_process_has_not_finished_is_no_result(tmp_path):
     folder = RunFolder.create(tmp_path / "run", SETTING)
     cell = Cell(REACH, "uca_flow", 0)
@@ -231,6 +266,26 @@ def test_a_report_does_not_replace_what_it_reports(folder, tmp_path):
     with pytest.raises(UserError, match="is what is to be reported: its rows would be replaced"):
         main(["report", f"{tmp_path}/report", f"--output={tmp_path}/run/../report", "--policies=uca_flow"])
     assert {path: path.read_bytes() for path in (tmp_path / "report").iterdir()} == before
+
+
+def test_a_report_does_not_replace_a_runs_setting(folder, tmp_path):
+    other = RunFolder.create(tmp_path / "other", replace(SETTING, batch_size=9))
+    add_cell(other, Cell(REACH, "uca_flow", 0), 79)
+    before = (other.path / "setting.json").read_bytes()
+    with pytest.raises(UserError, match="is the folder of a run, whose setting would be replaced"):
+        main(["report", str(folder.path), f"--output={other.path}"])
+    assert (other.path / "setting.json").read_bytes() == before
+
+
+def test_a_report_leaves_no_figures_of_the_one_before(folder, tmp_path):
+    output = tmp_path / "report"
+    main(["report", str(folder.path), f"--output={output}"])
+    (output / "rollouts.png").touch()
+    assert (output / "success_over_minutes.png").exists()
+    main(["report", str(folder.path), f"--output={output}", "--policies=adaln"])
+    assert {path.stem for path in output.glob("*.png")} == {path.stem for path in output.glob("*.svg")}
+    assert not (output / "success_over_minutes.png").exists()
+    assert not (output / "rollouts.png").exists()
 
 
 def test_tuning_has_other_episodes_and_is_left_out_beside_the_table(tmp_path, capsys):

@@ -98,6 +98,7 @@ def test_a_result_says_how_it_was_made(finished):
     assert result["setting"] == folder.setting.as_values()
     assert result["versions"]["lerobot"] == "0.6.1"
     assert result["hardware"]["cores"] >= 1
+    assert "expert" in result
     assert result["dtype"] == ("bfloat16" if has_bfloat16("cpu") else "float32")
     assert result["minutes"]["training"] > 0
     assert result["inference"]["median_ms"] > 0

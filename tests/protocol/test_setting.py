@@ -1,3 +1,4 @@
+from datetime import date
 from itertools import combinations
 
 import pytest
@@ -107,6 +108,8 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
             "benchmarks holds options by benchmark (adroit, metaworld), got 'libero'",
         ),
         ({**GOOD, "name": None}, "name must be text, got None"),
+        ({**GOOD, "policy": {"since": date(2024, 1, 1)}}, "what no setting can hold: Object of type date is not JSON"),
+        ({**GOOD, "policy": {"optimizer_lr": float("nan")}}, "what no setting can hold: Out of range float values"),
         (
             {**GOOD, "policies": {"uca": {}}},
             "policies holds options by type (dp3, flowpolicy, mp1, simple_dp3, uca_flow",

@@ -3,6 +3,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,14 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import run_cell as run_cell_module
 from lerobot_uca.protocol import training
 from lerobot_uca.protocol.cells import Cell
+from lerobot_uca.protocol.command import main
 from lerobot_uca.protocol.folder import RunFolder, write_json
 from lerobot_uca.protocol.launchers import Ended
+from lerobot_uca.protocol.rows import Row, write_rows
 from lerobot_uca.protocol.run import run as run_cells
 from lerobot_uca.protocol.run_cell import Outcome, run_cell
 from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.protocol.tied import PARENT, tied
 from lerobot_uca.protocol.training import CellError, NoSpaceError, as_arguments, run
 
 CELL, OTHER = (Cell("metaworld/reach", "uca_flow", seed) for seed in (0, 1))
@@ -87,6 +91,93 @@ def test_demonstrations_are_made_as_the_setting_says(tmp_path, monkeypatch):
     assert command == "lerobot-uca-collect"
     expected = {"--env.task=reach", "--n_episodes=10", "--smoothing=0.5", "--pushes=0.1", "--successful_steps=7"}
     assert {*expected, "--straight_paths=true", "--env.observation=object_cloud"} <= set(arguments)
+
+
+@pytest.fixture
+def adroit(tmp_path, monkeypatch) -> RunFolder:
+    """A folder in which Adroit's demonstrations are made at once."""
+
+    def collected(command, arguments, **_):
+        root = Path(next(text for text in arguments if text.startswith("--root=")).removeprefix("--root="))
+        for file in ("meta/info.json", "data/chunk-000/file-000.parquet"):
+            (root / file).parent.mkdir(parents=True)
+            (root / file).touch()
+
+    monkeypatch.setattr(training, "run", collected)
+    values = {"description": "-", "batch_size": 8, "lengths": {"adroit": {"steps": 4, "evaluations": 2}}}
+    return RunFolder.create(tmp_path / "run", Setting.from_values("tiny", values))
+
+
+def test_a_task_has_one_expert(adroit, tmp_path):
+    """By what its file holds, wherever it lies."""
+    for name, text in (("a", "weights"), ("b", "weights"), ("c", "others")):
+        (tmp_path / f"{name}_pen.npz").write_text(text)
+    cell = Cell("adroit/pen", "uca_flow", 0)
+    dataset = training.collect(adroit, cell, f"{tmp_path}/a_{{task}}.npz")
+    expert = training.demonstrator(dataset)
+    assert expert.startswith("sha256:")
+    training.collect(adroit, cell, f"{tmp_path}/b_{{task}}.npz")
+    for other in ("c_{task}.npz", "nowhere/{task}.npz"):
+        with pytest.raises(CellError, match=f"demonstrations are by another expert: {expert}, now it is"):
+            training.collect(adroit, cell, f"{tmp_path}/{other}")
+    dataset.with_name("pen.json").unlink()  # a run of an earlier version
+    training.collect(adroit, cell, f"{tmp_path}/c_{{task}}.npz")
+
+
+def test_demonstrations_without_data_are_made_again(adroit):
+    cell = Cell("adroit/pen", "uca_flow", 0)
+    dataset = training.collect(adroit, cell, "minari:pen")
+    (dataset / "data/chunk-000/file-000.parquet").unlink()
+    training.collect(adroit, cell, "minari:pen")
+    assert (dataset / "data/chunk-000/file-000.parquet").exists()
+
+
+def test_experts_are_found_from_any_folder(tmp_path, monkeypatch):
+    """A Ray worker's, for example."""
+    given = []
+    monkeypatch.setattr("lerobot_uca.protocol.command.run", lambda *arguments: given.append(arguments[-1]) or True)
+    monkeypatch.chdir(tmp_path)
+    for expert in ("experts/{task}.npz", "minari:D4RL/{task}/expert-v2"):
+        main(["run", "--output=run", "--tasks=pen", f"--expert={expert}"])
+    assert given == [str(tmp_path / "experts/{task}.npz"), "minari:D4RL/{task}/expert-v2"]
+
+
+def test_a_child_whose_parent_is_gone_before_it_is_tied_ends(tmp_path):
+    """As when the command is killed while a cell starts: it would keep the cell claimed."""
+    command = [sys.executable, "-m", "lerobot_uca.protocol.tied", "/bin/sh", "-c", f"touch {tmp_path}/ran"]
+    orphan = subprocess.run(command, env={**os.environ, PARENT: "1"}, check=False)
+    assert orphan.returncode == 1
+    assert not (tmp_path / "ran").exists()
+    assert subprocess.run(command, env={**os.environ, **tied()}, check=False).returncode == 0
+    assert (tmp_path / "ran").exists()
+
+
+def test_an_evaluation_that_lacks_episodes_is_made_again(folder, monkeypatch):
+    files = folder.cell(CELL)
+    files.rows.mkdir(parents=True)
+    seeds = folder.setting.final_seeds(CELL)
+    rows = [Row(*CELL, 4, 1.0, True, seed, True, 1.0, 200, 5.0) for seed in seeds]
+    asked = []
+    monkeypatch.setattr(training, "checkpoint", lambda *_: asked.append(1))  # there is none
+    for n_rows in (0, 1, len(rows)):
+        write_rows(files.rows / "final.csv", rows[:n_rows])
+        with suppress(CellError):
+            run_cell_module._evaluate_checkpoint(folder, CELL, Path(), 4, is_final=True)
+    assert len(asked) == 2  # not where all are there
+
+
+def test_minutes_of_a_training_that_left_nothing_do_not_count(folder, monkeypatch):
+    files = folder.cell(CELL)
+    monkeypatch.setattr(training, "collect", lambda *_: Path())
+    monkeypatch.setattr(training, "train", lambda *_: None)
+    monkeypatch.setattr(run_cell_module, "_evaluate", lambda *_: 1 / 0)
+    files.path.mkdir(parents=True)
+    for is_left, minutes in ((False, 0), (True, 7)):
+        (files.path / "training_minutes.txt").write_text("7.0")
+        if is_left:
+            (files.training / "checkpoints" / "last").mkdir(parents=True)
+        run_cell(folder, CELL, None)
+        assert float((files.path / "training_minutes.txt").read_text()) == pytest.approx(minutes, abs=0.1)
 
 
 def test_a_cell_without_space_stops_the_run_and_stays_open(folder, monkeypatch):

@@ -11,7 +11,7 @@ from typing import Any, override
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR
 
 from lerobot_uca.bounds import check_bounds, within
@@ -151,10 +151,25 @@ def _vectorize(make: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -
     # LeRobot waits for the slowest of a batch; an environment that has finished must not go on simulating.
     if use_async_envs and n_envs > 1:
         return _AsyncVectorEnv([make] * n_envs)  # freezes by itself
-    return gym.vector.SyncVectorEnv([freeze_after_episode_end(make)] * n_envs)
+    return _SyncVectorEnv([freeze_after_episode_end(make)] * n_envs)
 
 
-class _AsyncVectorEnv(_LazyAsyncVectorEnv):
+class _ResetsAll:
+    """A vector environment whose reset begins episodes in all of its environments, also in those that are frozen.
+
+    Unfrozen they are by LeRobot's option alone, which a loop of somebody else does not pass.
+    """
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None) -> Any:
+        parent: Any = super()
+        return parent.reset(seed=seed, options={**(options or {}), NEW_ROLLOUT_OPTION: True})
+
+
+class _SyncVectorEnv(_ResetsAll, gym.vector.SyncVectorEnv):
+    """Gymnasium's."""
+
+
+class _AsyncVectorEnv(_ResetsAll, _LazyAsyncVectorEnv):
     """LeRobot's, whose workers do not complain when a signal ends the command."""
 
     def _ensure(self) -> None:

@@ -74,7 +74,10 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 def _run(args: argparse.Namespace) -> None:
     cells = grid(args.suite, args.tasks, args.policies, args.seeds)
     folder = make_folder(args.output, args.setting)
-    if not run(folder, cells, _launcher(args, folder), args.expert):
+    expert = args.expert
+    if expert and not expert.startswith("minari:"):
+        expert = str(Path(expert).absolute())  # a cell may run in another folder, on Ray for example
+    if not run(folder, cells, _launcher(args, folder), expert):
         sys.exit(1)
 
 

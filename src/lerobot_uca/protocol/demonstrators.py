@@ -69,7 +69,7 @@ def demonstrators(tasks: Sequence[str], path: Path, how: Demonstrating, n_episod
     """
     import mujoco
 
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _write(path, [])  # an --output that cannot be written is told at once
     rows: list[Demonstrator] = []
     prepared = [(task, *_of_task(task, how)) for task in tasks]  # wrong options are told at once
     for task, make_env, attempts in tqdm(prepared, desc="Experts", unit="task"):
@@ -127,6 +127,7 @@ def _of_task(task: str, how: Demonstrating) -> tuple[Callable[[], PointCloudEnv]
 
 def _write(path: Path, rows: Sequence[Demonstrator]) -> None:
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerows([Demonstrator._fields, *rows])

@@ -27,6 +27,8 @@ def draw(results: Results, folder: Path) -> list[Path]:
     """
     plt = pyplot()
     drawn = {name: figure(results, plt) for name, figure in FIGURES.items()}
+    for name in [name for name, figure in drawn.items() if figure is None]:
+        remove(folder / name)
     return [write(figure, folder / name) for name, figure in drawn.items() if figure is not None]
 
 
@@ -55,6 +57,12 @@ def write(figure: Any, path: Path) -> Path:
         figure.savefig(path.with_suffix(f".{ending}"), dpi=150, bbox_inches="tight", metadata=metadata)
     pyplot().close(figure)
     return path.with_suffix(".svg")
+
+
+def remove(path: Path) -> None:
+    """Remove an earlier report's figure, by a path without its ending: it would stand beside other tables."""
+    for ending in ("png", "svg"):
+        path.with_suffix(f".{ending}").unlink(missing_ok=True)
 
 
 def curves(results: Results, plt: Any) -> Any:

@@ -2,7 +2,7 @@
 
 DIR/setting.json                               the setting of all cells
 DIR/progress.log                               a line for each thing that happened
-DIR/demonstrations/TASK/                       the dataset that all cells of a task share
+DIR/demonstrations/TASK/                       the dataset that all cells of a task share; beside it TASK.json, by whom
 DIR/cells/TASK/POLICY/SEED/training/           LeRobot's output folder
                           /rows/step_*.csv     evaluations during training, rows/final.csv the last one
                           /cell.json           written when the cell is finished
@@ -14,7 +14,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from io import TextIOWrapper
 from pathlib import Path
@@ -25,6 +25,9 @@ from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.rows import CorruptRow, Row, read_rows
 from lerobot_uca.protocol.setting import Setting
 from lerobot_uca.whole_file import whole_file
+
+RECORDED = ("cell", "minutes", "inference", "hardware")
+"""What reports need of a cell.json."""
 
 
 class CellFolder:
@@ -41,7 +44,9 @@ class CellFolder:
     @property
     def is_finished(self) -> bool:
         """Whether nothing is left to do."""
-        return self.result.exists()
+        with suppress(UserError):
+            return is_record(read_json(self.result))
+        return False
 
     @contextmanager
     def claim(self) -> Iterator[TextIOWrapper | None]:
@@ -94,7 +99,7 @@ class RunFolder:
         file = path / "setting.json"
         if not file.is_file():
             raise UserError(f"'{path}' is not the folder of a benchmark run: it has no setting.json.")
-        return cls(path, Setting.from_values(path.name, _read_json(file)))
+        return cls(path, Setting.from_values(path.name, read_json(file)))
 
     def cell(self, cell: Cell) -> CellFolder:
         """The files of a cell."""
@@ -113,7 +118,10 @@ class RunFolder:
         """Print a line with the time, and add it to progress.log. One write: lines of several processes do not mix."""
         line = f"{datetime.now(UTC).astimezone():%Y-%m-%d %H:%M:%S} {message}"
         print(line, flush=True)
-        with (self.path / "progress.log").open("a", encoding="utf-8") as file:
+        with (
+            suppress(OSError),
+            (self.path / "progress.log").open("a", encoding="utf-8") as file,
+        ):  # the disk may be full
             file.write(f"{line}\n")
 
     def read(self) -> Iterator[Row | CorruptRow]:
@@ -125,9 +133,12 @@ class RunFolder:
     def records(self) -> Iterator[dict[str, Any]]:
         """The record of each finished cell."""
         for path in self.path.glob("cells.json"):
-            yield from _read_json(path)["cells"]
+            yield from read_json(path)["cells"]
         for path in sorted(self.path.glob("cells/*/*/*/*/cell.json")):
-            yield _read_json(path)
+            record = read_json(path)
+            if not is_record(record):
+                raise UserError(f"'{path}' is not what is recorded of a cell: it has no {', '.join(RECORDED)}.")
+            yield record
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -137,7 +148,17 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
         unfinished.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 
 
-def _read_json(path: Path) -> Any:
+def is_record(values: Any) -> bool:
+    """Whether these are what a finished cell's cell.json holds, as far as reports need it."""
+    return isinstance(values, dict) and values.keys() >= {*RECORDED}
+
+
+def read_json(path: Path) -> Any:
+    """The values in a JSON file.
+
+    Raises:
+        UserError: if it cannot be read.
+    """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -55,18 +55,24 @@ def mean_rate(tasks: Sequence[Successes]) -> Estimate:
     mean, variance, critical = _stratified(tasks)
     if variance > 0:
         return wilson(mean, mean * (1 - mean) / variance, critical)
-    return wilson(mean, len(tasks) ** 2 / sum(1 / successes.shape[1] for successes in tasks))
+    return wilson(mean, _n_episodes(tasks))
 
 
 def mean_difference(tasks: Sequence[Successes]) -> Estimate:
     """The mean over tasks of two policies' differences, with Student's interval.
 
     Args:
-        tasks: at least one. Where no episode and no seed differs from another, the interval has no width.
+        tasks: at least one. Where no episode and no seed differs from another, the interval is as wide as that of so
+            many episodes without a failure, from -1 to 1 being twice as far as from 0 to 1.
     """
     mean, variance, critical = _stratified(tasks)
-    half = critical * math.sqrt(variance)
+    half = critical * math.sqrt(variance) if variance > 0 else 2 * (1 - wilson(1.0, _n_episodes(tasks)).low)
     return Estimate(mean, max(-1.0, mean - half), min(1.0, mean + half))
+
+
+def _n_episodes(tasks: Sequence[Successes]) -> float:
+    """As many independent episodes as a mean over tasks is worth if they all vary alike."""
+    return len(tasks) ** 2 / sum(1 / successes.shape[1] for successes in tasks)
 
 
 def _stratified(tasks: Sequence[Successes]) -> tuple[float, float, float]:

@@ -19,6 +19,7 @@ from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import RunFolder
 from lerobot_uca.protocol.run_cell import Outcome
 from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.protocol.tied import tied
 
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
@@ -52,7 +53,7 @@ def _start(folder: Path, cell: Cell, expert: str | None, gpu: str | None = None)
     arguments = [str(folder), cell.task, cell.policy, str(cell.seed), *([expert] if expert else [])]
     command = [sys.executable, "-m", "lerobot_uca.protocol.run_cell", *arguments]
     chosen = {} if gpu is None else {VISIBLE_GPUS: gpu}
-    return subprocess.Popen(command, env={**os.environ, **ONE_THREAD, **chosen})  # noqa: S603
+    return subprocess.Popen(command, env={**os.environ, **ONE_THREAD, **chosen, **tied()})  # noqa: S603
 
 
 def local(n_parallel: int | None = None) -> Launcher:

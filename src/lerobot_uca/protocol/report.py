@@ -9,7 +9,7 @@ from pathlib import Path
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import rollouts
 from lerobot_uca.protocol.cells import POLICIES
-from lerobot_uca.protocol.figures import CAPTIONS, draw
+from lerobot_uca.protocol.figures import CAPTIONS, draw, remove
 from lerobot_uca.protocol.results import Results
 from lerobot_uca.protocol.tables import TABLES, setting_of
 
@@ -44,6 +44,8 @@ def report(
     """
     if output.resolve() in [run.resolve() for run in runs]:
         raise UserError(f"--output '{output}' is what is to be reported: its rows would be replaced. Choose another.")
+    if (output / "cells").exists():
+        raise UserError(f"--output '{output}' is the folder of a run, whose setting would be replaced. Choose another.")
     results, corrupt = Results.read(runs)
     for line in corrupt:
         print(f"warning: {line}", file=sys.stderr)
@@ -69,6 +71,8 @@ def report(
         figures = draw(results, output)
         if strips:
             figures.append(rollouts.draw(strips, output))
+        else:
+            remove(output / "rollouts")
         if as_html:
             page = _page(results, [table.html() for table in tables], figures)
             (output / "report.html").write_text(page, encoding="utf-8")

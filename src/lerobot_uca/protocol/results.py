@@ -74,6 +74,7 @@ class Results:
         found = [(folder.path, row) for folder in folders for row in folder.read()]
         rows = _without_repetition([(path, row) for path, row in found if isinstance(row, Row)])
         records = [record for folder in folders for record in folder.records()]
+        _check_experts(records)
         return cls(first.setting, rows, records), [row for _, row in found if isinstance(row, CorruptRow)]
 
     def of(self, is_wanted: Callable[[Cell], bool]) -> Self:
@@ -129,11 +130,11 @@ class Results:
         return sum(bool(self.seeds(task, policy)) for task in tasks)
 
     def honest(self, tasks: Sequence[str], policy: str) -> Estimate | None:
-        """Success on those of the tasks that are there: Wilson's interval, for one task of its episodes."""
+        """Success on those of the tasks that are there; of a single training Wilson's interval of its episodes."""
         there = [found for task in tasks if (found := self.successes(task, policy)) is not None]
         if not there:
             return None
-        if len(tasks) == 1:
+        if len(there) == len(there[0]) == 1:
             return wilson(float(there[0].mean()), there[0].shape[1])
         return mean_rate(there)
 
@@ -228,11 +229,27 @@ def _hardware(kind: dict[str, Any], dtype: str | None) -> str:
     return f"{kind['gpu'] or kind['cpu']} ({kind['cores']} cores, {kind['threads']} thread a cell{precision})"
 
 
+def _check_experts(records: Iterable[dict[str, Any]]) -> None:
+    """A task's cells have learned from one demonstrator; earlier versions did not record it."""
+    experts: dict[str, set[str]] = defaultdict(set)
+    for record in records:
+        if record.get("expert") is not None:
+            experts[record["cell"]["task"]].add(record["expert"])
+    for task, found in experts.items():
+        if len(found) > 1:
+            raise UserError(
+                f"Cells of {task} have learned from different experts: {', '.join(sorted(found))}. A table holds "
+                "results of one."
+            )
+
+
 def _without_repetition(found: Iterable[tuple[Path, Row]]) -> list[Row]:
     """Each episode once: a run's and its report's folder hold the same."""
     first: dict[tuple[Any, ...], tuple[Path, Row]] = {}
     for path, row in found:
-        other, same = first.setdefault((*row.cell, row.step, row.is_final, row.episode_seed), (path, row))
+        # A cell has one last checkpoint, whatever its step.
+        key = (*row.cell, None if row.is_final else row.step, row.episode_seed)
+        other, same = first.setdefault(key, (path, row))
         if row != same:
             raise UserError(
                 f"'{other}' and '{path}' hold different results of {row.cell}, in the episode of seed "

@@ -22,7 +22,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import training
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import CellFolder, RunFolder, write_json
-from lerobot_uca.protocol.rows import CorruptRow, Row, read_rows, write_rows
+from lerobot_uca.protocol.rows import Row, read_rows, write_rows
 from lerobot_uca.protocol.tied import tie_to_parent
 from lerobot_uca.protocol.training import CellError, NoSpaceError, no_space_as_such
 from lerobot_uca.whole_file import whole_file
@@ -59,7 +59,7 @@ def run_cell(folder: RunFolder, cell: Cell, expert: str | None) -> Outcome:
                 _work(folder, cell, expert, lock)
             return Outcome.FINISHED
     except NoSpaceError as error:
-        _try_to_log(folder, f"{cell}: {error}")
+        folder.log(f"{cell}: {error}")
         return Outcome.NO_SPACE
     except (CellError, UserError) as error:
         reason = str(error)
@@ -77,12 +77,14 @@ def _work(folder: RunFolder, cell: Cell, expert: str | None, lock: TextIOWrapper
     dataset = training.collect(folder, cell, expert)
     if training.checkpoint(files, length.steps) is None:
         folder.log(f"{cell}: training {length.steps} steps")
+    if not (files.training / "checkpoints" / "last").exists():  # nothing is left of earlier minutes
+        _minutes_file(files, "training").unlink(missing_ok=True)
     with _minutes(files, "training"):
         training.train(files, setting, dataset, lock)
     with _minutes(files, "evaluation"):
         _evaluate(folder, cell, dataset)
     final = [row for row in read_rows(files.rows / "final.csv") if isinstance(row, Row)]
-    write_json(files.result, _result(folder, cell, final))
+    write_json(files.result, _result(folder, cell, dataset, final))
     files.failure.unlink(missing_ok=True)
 
 
@@ -111,10 +113,12 @@ def load_lerobot() -> None:
 
 
 def _evaluate_checkpoint(folder: RunFolder, cell: Cell, dataset: Path, step: int, *, is_final: bool) -> None:
-    """Write an evaluation's rows, unless they are there."""
+    """Write an evaluation's rows, unless all of them are there."""
     files, setting = folder.cell(cell), folder.setting
     path = files.rows / ("final.csv" if is_final else f"step_{step:06d}.csv")
-    if path.exists() and not any(isinstance(row, CorruptRow) for row in read_rows(path)):
+    index = step // setting.length(cell).interval - 1
+    seeds = setting.final_seeds(cell) if is_final else setting.interim_seeds(cell, index)
+    if path.exists() and [getattr(row, "episode_seed", None) for row in read_rows(path)] == [*seeds]:
         return
     from lerobot_uca.protocol.evaluation import PolicyPlan, run_episodes
 
@@ -123,8 +127,6 @@ def _evaluate_checkpoint(folder: RunFolder, cell: Cell, dataset: Path, step: int
         raise CellError(f"its checkpoint after {step} steps is gone. Remove '{files.path}' to train anew")
     plan = PolicyPlan.from_checkpoint(checkpoint)
     epoch = step * setting.batch_size / _n_frames(dataset)
-    index = step // setting.length(cell).interval - 1
-    seeds = setting.final_seeds(cell) if is_final else setting.interim_seeds(cell, index)
     episodes = run_episodes(make_env(cell, plan), plan.config, plan, seeds, n_envs=N_ENVS)
     rows = [
         Row(*cell, step, epoch, is_final, each.seed, each.success, each.episode_return, each.length, each.ms)
@@ -150,7 +152,7 @@ def _n_frames(dataset: Path) -> int:
     return json.loads((dataset / "meta" / "info.json").read_text(encoding="utf-8"))["total_frames"]
 
 
-def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
+def _result(folder: RunFolder, cell: Cell, dataset: Path, final: list[Row]) -> dict[str, Any]:
     from lerobot_uca.protocol.latency import measure
     from lerobot_uca.protocol.record import provenance
 
@@ -165,6 +167,7 @@ def _result(folder: RunFolder, cell: Cell, final: list[Row]) -> dict[str, Any]:
         "minutes": {phase: _read_minutes(files, phase) for phase in ("training", "evaluation")},
         "inference": measure(checkpoint),
         "setting": setting.as_values(),
+        "expert": training.demonstrator(dataset),
         "training_options": training.training_options(cell, setting),
         "dtype": config["dtype"],  # the processor decides, too (policies/precision.py)
         **provenance(config["device"]),
@@ -177,7 +180,7 @@ def _minutes(files: CellFolder, phase: str) -> Iterator[None]:
     before, begin = _read_minutes(files, phase), time.monotonic()
 
     def note() -> None:
-        with suppress(OSError), whole_file(files.path / f"{phase}_minutes.txt") as unfinished:
+        with suppress(OSError), whole_file(_minutes_file(files, phase)) as unfinished:
             unfinished.write_text(f"{before + (time.monotonic() - begin) / 60:.3f}\n", encoding="utf-8")
 
     def keep_noting() -> None:
@@ -197,16 +200,13 @@ def _minutes(files: CellFolder, phase: str) -> Iterator[None]:
 
 def _read_minutes(files: CellFolder, phase: str) -> float:
     try:
-        return float((files.path / f"{phase}_minutes.txt").read_text(encoding="utf-8"))
+        return float(_minutes_file(files, phase).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return 0.0
 
 
-def _try_to_log(folder: RunFolder, message: str) -> None:
-    try:
-        folder.log(message)
-    except OSError:
-        print(message, file=sys.stderr)
+def _minutes_file(files: CellFolder, phase: str) -> Path:
+    return files.path / f"{phase}_minutes.txt"
 
 
 def main() -> None:

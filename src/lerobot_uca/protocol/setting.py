@@ -142,6 +142,10 @@ class Setting:
     def check(self) -> None:
         """Raise a `UserError` for values that cannot be."""
         self._check_mappings()
+        try:
+            json.dumps(self.as_values(), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise UserError(f"Setting '{self.name}' holds what no setting can hold: {error}.") from error
         counts = ("batch_size", "demonstrations", "interim_episodes", "final_episodes")
         for name, value in [(name, getattr(self, name)) for name in counts]:
             if type(value) is not int or value < 1:

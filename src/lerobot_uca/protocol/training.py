@@ -1,6 +1,7 @@
 """Demonstrations and training of a cell, by the commands that a user would type, each in a process of its own."""
 
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -15,9 +16,11 @@ from typing import Any
 
 from lerobot_uca.features import POINT_CLOUD
 from lerobot_uca.protocol.cells import Cell
-from lerobot_uca.protocol.folder import CellFolder, RunFolder
+from lerobot_uca.protocol.folder import CellFolder, RunFolder, read_json, write_json
 from lerobot_uca.protocol.setting import Setting
+from lerobot_uca.protocol.tied import tied
 
+BUILT_IN = "built in"
 LOG_TAIL = 2000  # characters in which a failing command has said why
 
 
@@ -32,7 +35,8 @@ class NoSpaceError(Exception):
 def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
     """The task's demonstrations, made if they are not there. Others who need them wait."""
     with folder.demonstrations(cell) as dataset:
-        if not (dataset / "meta" / "info.json").exists():
+        identity = _identity(expert, cell)
+        if not ((dataset / "meta" / "info.json").exists() and any(dataset.glob("data/**/*.parquet"))):
             shutil.rmtree(dataset, ignore_errors=True)
             folder.log(f"{cell.task}: collecting {folder.setting.demonstrations} demonstrations")
             options = {
@@ -51,7 +55,28 @@ def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
             if expert is not None and cell.benchmark == "adroit":
                 options["expert"] = expert
             run("lerobot-uca-collect", as_arguments(options), log=folder.cell(cell).path / "collect.log")
+            write_json(_made_by(dataset), {"expert": identity})
+        elif (made := demonstrator(dataset)) not in (None, identity):
+            raise CellError(f"its demonstrations are by another expert: {made}, now it is {identity}")
         return dataset
+
+
+def demonstrator(dataset: Path) -> str | None:
+    """Who has demonstrated a task; None for a run of an earlier version, which did not record it."""
+    made_by = _made_by(dataset)
+    return read_json(made_by)["expert"] if made_by.exists() else None
+
+
+def _made_by(dataset: Path) -> Path:
+    return dataset.with_name(f"{dataset.name}.json")
+
+
+def _identity(expert: str | None, cell: Cell) -> str:
+    """What demonstrates a task: a dataset, or a file by what it holds, wherever it lies."""
+    if expert is None or cell.benchmark != "adroit":
+        return BUILT_IN
+    path = Path(expert.replace("{task}", cell.env_task))
+    return f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}" if path.is_file() else expert
 
 
 def train(cell_folder: CellFolder, setting: Setting, dataset: Path, lock: TextIOWrapper) -> None:
@@ -138,8 +163,10 @@ def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | 
         file.flush()
         start = file.tell()
         keep_open = () if keep is None else (keep.fileno(),)
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file}
+        environment = {**os.environ, **tied()}
         result = subprocess.run(  # noqa: S603
-            [*command, *arguments], stdout=file, stderr=file, stdin=subprocess.DEVNULL, pass_fds=keep_open, check=False
+            [*command, *arguments], **streams, env=environment, pass_fds=keep_open, check=False
         )
     if result.returncode:
         said = _tail(log, start)
