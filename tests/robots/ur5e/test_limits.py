@@ -16,8 +16,6 @@ def test_no_stream_of_targets_breaks_a_limit(seed):
     for _ in range(150):
         interpolator.set_target(rng.uniform(-3, 3, 6), duration=rng.choice([0.001, 0.03, 0.5]))
         path += [interpolator.step(DT).copy() for _ in range(rng.integers(1, 60))]
-        if rng.random() < 0.2:  # the controller's data are late
-            path += [interpolator.brake(DT).copy() for _ in range(rng.integers(1, 60))]
     velocity = np.diff(path, axis=0) / DT
     assert np.abs(path).max() <= 1.0 + 1e-12
     assert np.abs(velocity).max() <= LIMITS.velocity + 1e-9
@@ -78,16 +76,28 @@ def test_a_steady_stream_is_followed_smoothly():
     np.testing.assert_allclose(lag, velocity**2 / (2 * LIMITS.acceleration), atol=0.003)
 
 
-def test_braking_ends_standing_still():
+def test_after_a_gap_it_goes_on_from_where_the_controller_stands():
     interpolator = Interpolator(REST, LIMITS)
     interpolator.set_target(np.full(6, 0.9), duration=0.1)
     for _ in range(60):
         interpolator.step(DT)
-    assert interpolator.qd.min() == pytest.approx(LIMITS.velocity)
-    path = [interpolator.q.copy(), *(interpolator.brake(DT).copy() for _ in range(40))]
-    assert (path[-1] == path[-2]).all()
-    way = LIMITS.velocity**2 / (2 * LIMITS.acceleration)
-    np.testing.assert_allclose(path[-1] - path[0], way, atol=LIMITS.velocity * DT)
+    there = interpolator.q - 0.1  # the controller has not heard of the last ones
+    interpolator.go_on_from(there)
+    path = [there, there, *(interpolator.step(DT).copy() for _ in range(200))]
+    velocity = np.diff(path, axis=0) / DT
+    assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration * DT + 1e-9
+    assert np.abs(velocity).max() <= LIMITS.velocity + 1e-9
+    np.testing.assert_allclose(path[-1], 0.9, atol=1e-6)
+
+
+def test_a_target_may_have_a_velocity_of_its_own():
+    interpolator = Interpolator(REST, LIMITS)
+    interpolator.set_target(np.full(6, 0.5), duration=0.01, velocity=0.2)
+    path = [interpolator.step(DT).copy() for _ in range(100)]
+    assert np.diff(path, axis=0).max() / DT == pytest.approx(0.2)
+    interpolator.set_target(np.full(6, 0.9), duration=0.01, velocity=5.0)
+    path = [interpolator.step(DT).copy() for _ in range(100)]
+    assert np.diff(path, axis=0).max() / DT == pytest.approx(LIMITS.velocity)
 
 
 def test_a_target_inside_the_limits_is_untouched():

@@ -82,9 +82,10 @@ def fastest(setpoints, robot) -> float:
 def stream(robot, velocity, seconds=2.0, rate=30.0):
     """Joint targets that move at a velocity; the last one."""
     q = np.array([robot.get_observation()[key] for key in JOINT_KEYS])
+    gripper = {} if robot.config.gripper == "none" else {GRIPPER_KEY: 0.0}
     for _ in range(round(seconds * rate)):
         q = q + velocity / rate
-        robot.send_action(action_at(q))
+        robot.send_action({**dict(zip(JOINT_KEYS, q, strict=True)), **gripper})
         time.sleep(1 / rate)
     return q
 
@@ -407,7 +408,7 @@ def test_a_program_that_somebody_paused_is_refused(controller, tmp_path):
         make_robot(controller, tmp_path).connect()
 
 
-def test_late_data_brake_the_setpoint_which_then_goes_on(controller, robot):
+def test_late_data_hold_the_setpoint_which_then_goes_on(controller, robot):
     keep_moving(robot)
     wait_until(lambda: speed(controller) > 0.1)
     controller.network.is_silent = True
@@ -415,6 +416,38 @@ def test_late_data_brake_the_setpoint_which_then_goes_on(controller, robot):
     assert robot._arm.state().is_servoing
     controller.network.is_silent = False
     wait_until(lambda: speed(controller) > 0.1)
+
+
+def test_after_a_silence_of_the_network_the_arm_keeps_its_limits(controller, tmp_path):
+    """What was commanded meanwhile has not come: going on from there would be a jump."""
+    robot = make_robot(controller, tmp_path, max_velocity=0.35, max_acceleration=1.0)
+    with robot:
+        keep_moving(robot)
+        wait_until(lambda: speed(controller) > 0.2)
+        setpoints = keep_setpoints(controller)
+        controller.network.is_silent = True
+        wait_until(lambda: has_braked(robot))
+        controller.network.is_silent = False
+        n_before = len(setpoints)
+        wait_until(lambda: speed(controller) > 0.2 and len(setpoints) > n_before + 50)
+        assert fastest(setpoints, robot) < 1.02 * 0.35
+
+
+class SlowedArm(IdealArm):
+    """An arm whose controller scales its speed down, as the pendant's slider does."""
+
+    def follow(self, target_q, dt):
+        super().follow(self.q + np.clip(target_q - self.q, -0.05 * dt, 0.05 * dt), dt)
+
+
+def test_an_arm_that_does_not_follow_is_not_led_on(tmp_path):
+    """Let go, it would make up for all of it as fast as it can."""
+    with Controller(SlowedArm(), address=free_address()) as controller:
+        robot = make_robot(controller, tmp_path, gripper="none")
+        with robot:
+            robot.send_action(dict(zip(JOINT_KEYS, HOME, strict=True)))
+            with pytest.raises(ArmStoppedError, match=r"does not follow, it is 0\.2\d rad behind: the speed slider"):
+                stream(robot, 0.3, seconds=4)
 
 
 def has_braked(robot) -> bool:

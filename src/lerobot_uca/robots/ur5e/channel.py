@@ -1,6 +1,7 @@
 """The channel between the driver and the process that talks to the arm: a line of JSON for each message."""
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -31,6 +32,7 @@ class Target:
 
     q: tuple[float, ...]  # (6,) [rad]
     duration: float  # [s]
+    velocity: float = math.inf  # [rad/s], no faster than that, and than the limits
     begins: bool = False  # a motion: an arm that stands still takes no other, which was sent before it was known to
 
 

@@ -11,6 +11,7 @@ from lerobot_uca.robots.ur5e.channel import ArmStoppedError
 
 PORT = 63352
 TIMEOUT = 2.0  # [s]
+ANSWERS_WITHIN = 0.5  # [s], after a suspension, in which what was heard last has become old
 ACTIVATION_TIMEOUT = 10.0  # [s]; the fingers move through their whole range meanwhile
 ACTIVE = 3  # of STA
 HEALTH_PERIOD = 0.1  # [s]
@@ -110,10 +111,17 @@ class RobotiqGripper:
     @property
     def position(self) -> float:
         """Measured. Raises `ArmStoppedError` where the gripper no longer answers."""
+        until = time.monotonic() + ANSWERS_WITHIN
+        while self._failure is None and self._is_old and time.monotonic() < until:
+            time.sleep(0.005)
         with self._lock:
-            if self._failure is not None or time.monotonic() - self._heard_at > TIMEOUT:
+            if self._failure is not None or self._is_old:
                 raise ArmStoppedError(self._failure or "The gripper no longer answers.")
             return self._position
+
+    @property
+    def _is_old(self) -> bool:
+        return time.monotonic() - self._heard_at > TIMEOUT
 
     def request(self, position: float) -> float:
         """Go to a position; what is commanded is returned: the nearest that the gripper can tell apart."""

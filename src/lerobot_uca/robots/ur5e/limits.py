@@ -1,6 +1,7 @@
 """Limits of what an arm is told to do. Pure functions of joint angles q [rad] and velocities qd [rad/s], (6,)."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class Interpolator:
     """
 
     def __init__(self, q: Array, limits: JointLimits) -> None:
-        self._limits = limits
+        self._limits = self._now = limits
         self.reset(q)
 
     def reset(self, q: Array) -> None:
@@ -70,12 +71,20 @@ class Interpolator:
         self._start = self._target = self.q
         self._elapsed, self._duration = 0.0, 1.0
 
-    def set_target(self, target: Array, duration: float) -> None:
-        """Go there, in that time [s] if the limits allow it. The joint range is held here, too.
+    def go_on_from(self, q: Array) -> None:
+        """Stand still at q, and go from there to the target that was set."""
+        target = self._target
+        self.reset(q)
+        self._target = target
 
+    def set_target(self, target: Array, duration: float, velocity: float = math.inf) -> None:
+        """Go there, in that time [s] and no faster than that velocity [rad/s], if the limits allow it.
+
+        The joint range is held here, too.
         A joint that stands outside the range may come back to it as slowly as it is told, but go no farther out.
         """
         self._start = self._reference()
+        self._now = replace(self._limits, velocity=min(velocity, self._limits.velocity))
         lower, upper = np.minimum(self._limits.lower, self.q), np.maximum(self._limits.upper, self.q)
         self._target = np.clip(target, lower, upper)
         self._elapsed, self._duration = 0.0, duration
@@ -92,11 +101,5 @@ class Interpolator:
     def step(self, dt: float) -> Array:
         """The setpoint (6,) a time dt later."""
         self._elapsed += dt
-        self.q, self.qd = step_towards(self.q, self.qd, self._reference(), self._limits, dt)
-        return self.q
-
-    def brake(self, dt: float) -> Array:
-        """The setpoint (6,) a time dt later if it comes to a stand. `step` then goes on from there."""
-        self.qd = np.sign(self.qd) * np.maximum(np.abs(self.qd) - self._limits.acceleration * dt, 0)
-        self.q = self.q + self.qd * dt
+        self.q, self.qd = step_towards(self.q, self.qd, self._reference(), self._now, dt)
         return self.q

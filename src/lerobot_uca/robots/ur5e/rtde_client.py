@@ -31,15 +31,18 @@ from lerobot_uca.robots.ur5e.channel import (
     encode,
 )
 from lerobot_uca.robots.ur5e.dashboard import stop_program
+from lerobot_uca.robots.ur5e.kinematics import Array
 from lerobot_uca.robots.ur5e.limits import Interpolator
 from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 
-# [s] Without new data from the controller: first the setpoint brakes, then this ends. A busy computer may
+# [s] Without new data from the controller: first the setpoint stays where it is, then this ends. A busy computer may
 # well wait for half a second, and its arm stands still meanwhile.
-FREEZE_AFTER, STALE_AFTER = 0.1, 1.0
+FREEZE_AFTER, STALE_AFTER = 0.05, 1.0
+PACKETS = 3  # that may be missing before the setpoint stays, where they come more slowly than that
 SAFEGUARD_STOP = 5  # RTDE's safety_mode
 STOPPED, PAUSED = 1, {3, 4, 5}  # RTDE's runtime_state; the latter are pausing, paused, resuming
 PAUSES_WITHIN = 0.5  # [s]
+FOLLOWS_WITHIN = 0.1  # [rad], besides what a setpoint is ahead by servoj's nature
 NEXT_DATA = 0.05  # [s]
 WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
 BRAKING = 4.0  # [rad/s^2], of servoStop
@@ -113,7 +116,8 @@ class ServoLoop:
         self._timestamp, self._changed_at = -1.0, time.monotonic()
         self._interpolator = Interpolator(np.array(self._receive.getActualQ()), settings.limits)
         self._is_servoing = False
-        self._idle_since = time.monotonic()
+        self._idle_since = self._commanded_at = time.monotonic()
+        self._was_stale = False
         if not self._control.setWatchdog(WATCHDOG_RATE):
             raise ArmStoppedError(f"The program on {settings.ip} did not take its watchdog; nothing has moved.")
 
@@ -167,14 +171,14 @@ class ServoLoop:
 
     def _accept(self, target: Target) -> None:
         q = np.array(target.q, dtype=np.float64)
-        if q.shape != (6,) or not np.isfinite(q).all() or not target.duration > 0:
-            raise ArmStoppedError(f"A target has six finite angles and a positive duration, got {target}.")
+        if q.shape != (6,) or not np.isfinite(q).all() or not (target.duration > 0 and target.velocity > 0):
+            raise ArmStoppedError(f"A target has six finite angles, positive duration and velocity, got {target}.")
         if not self._is_servoing:
             if not target.begins:
                 return
             self._interpolator.reset(np.array(self._receive.getActualQ()))
             self._is_servoing = True
-        self._interpolator.set_target(q, target.duration)
+        self._interpolator.set_target(q, target.duration, target.velocity)
         self._idle_since = time.monotonic() + target.duration
 
     def _command(self) -> None:
@@ -183,14 +187,38 @@ class ServoLoop:
             self.brake()
             self._channel.send(Note(f"No action for {idle:.1f} s: the arm has stopped, the next action eases in."))
         if not self._is_servoing:
+            self._commanded_at = time.monotonic()
             self._control.kickWatchdog()
             return
-        stale = self._age > FREEZE_AFTER
-        q = self._interpolator.brake(self._period) if stale else self._interpolator.step(self._period)
         settings = self._settings
+        q = self._next_setpoint()
         if not self._control.servoJ(q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain):
             self._check_again()
             raise ArmStoppedError("The controller did not take a target: its program is not running.")
+
+    def _next_setpoint(self) -> Array:
+        """The next one (6,), within the limits also of where the controller is.
+
+        What is commanded while the network is silent comes late or never, and nothing is commanded while this process
+        is suspended. Going on from the last setpoint would be a jump: it goes on from where the controller stands.
+        """
+        patience, now = max(FREEZE_AFTER, PACKETS * self._period), time.monotonic()
+        is_stale, was_stale = self._age > patience, self._was_stale
+        has_paused = now - self._commanded_at > patience
+        self._was_stale, self._commanded_at = is_stale, now
+        if is_stale:
+            return self._interpolator.q
+        if was_stale or has_paused:
+            self._interpolator.go_on_from(np.array(self._receive.getTargetQ()))
+        q = self._interpolator.step(self._period)
+        settings = self._settings
+        behind = float(np.abs(q - np.array(self._receive.getActualQ())).max())
+        if behind > FOLLOWS_WITHIN + settings.limits.velocity * (settings.lookahead + patience):
+            raise ArmStoppedError(
+                f"The arm does not follow, it is {behind:.2f} rad behind: the speed slider below 100 %, reduced mode, "
+                "or something holds it."
+            )
+        return q
 
     def _state(self) -> State:
         receive = self._receive

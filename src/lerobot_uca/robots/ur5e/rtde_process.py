@@ -62,7 +62,7 @@ class RtdeProcess:
         try:
             self.wait_for(lambda _: True, START_TIMEOUT, f"An answer from {settings.ip}")
         except BaseException:
-            self.kill()
+            self.stop("The connection was given up.")
             raise
 
     def _read(self) -> None:
@@ -82,9 +82,9 @@ class RtdeProcess:
                 self._state = message
             elif isinstance(message, Failure):
                 self._failure = message.text
-            elif isinstance(message, Note):
-                logger.warning(message.text)
             self._changed.notify_all()
+        if isinstance(message, Note):
+            logger.warning(message.text)
 
     def wait_for(self, condition: Callable[[State], bool], timeout: float, what: str) -> State:
         """The first state that meets a condition. Raises `ArmStoppedError` where none does or the arm stops.

@@ -4,6 +4,7 @@ import logging
 import math
 import os
 import time
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -36,10 +37,12 @@ from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
 JOINT_KEYS = tuple(f"{joint}.pos" for joint in JOINTS)
 TCP_KEYS = tuple(f"tcp_{axis}.pos" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 GRIPPER_KEY = "gripper.pos"
+PICTURES_WITHIN = 0.3  # [s], after a suspension
 ARM_TELLS_WITHIN = 0.2
 """[s] An emergency stop takes the gripper's power, too; where that is noticed first, the arm's reason follows."""
 
 STOP_COMES_WITHIN = 3.0
+STOP_COMES_EARLY = 0.05  # [s], for the way that messages take
 """[s] The longest step of a control_rate, and a busy computer's pause."""
 
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
@@ -148,17 +151,13 @@ class UR5eFollower(Robot):
             values = self._tcp_near = pose_to_vector(pose_from_vector(state.tcp), near=self._tcp_near)
         observation: RobotObservation = dict(zip(self._keys, values.tolist(), strict=False))
         if self._gripper is not None:
-            try:
-                observation[GRIPPER_KEY] = self._gripper.position
-            except ArmStoppedError as error:
-                reason = self._arm.failure_within(ARM_TELLS_WITHIN) or f"{error} The arm was stopped."
-                raise self._stopped(reason) from None
+            observation[GRIPPER_KEY] = self._gripper_position(self._gripper)
         for name, camera in self.cameras.items():
             try:
                 if getattr(camera, "use_rgb", True):
-                    observation[name] = camera.read_latest()
+                    observation[name] = _newest(camera.read_latest)
                 if getattr(camera, "use_depth", False):
-                    observation[f"{name}_depth"] = camera.read_latest_depth()
+                    observation[f"{name}_depth"] = _newest(camera.read_latest_depth)
             except (TimeoutError, RuntimeError, ConnectionError) as error:
                 raise self._stopped(f"Camera '{name}' gives no pictures ({error}); the arm was stopped.") from error
         return observation
@@ -176,6 +175,7 @@ class UR5eFollower(Robot):
         """
         assert self._arm is not None
         state = self._arm.state()
+        self._check_gripper()
         try:
             values = self._checked(action)
         except UserError as error:
@@ -202,15 +202,29 @@ class UR5eFollower(Robot):
         commanded = target if self.config.action == "joints" else self._tcp_at(target, state)
         return dict(zip(self._keys, [*commanded.tolist(), *commanded_gripper], strict=True))
 
-    def _send(self, target: Array, *, begins: bool) -> None:
+    def _send(self, target: Array, *, begins: bool, velocity: float = math.inf) -> None:
         assert self._arm is not None
         self._sent_at = time.monotonic()
-        self._arm.send(Target(tuple(target.tolist()), 1 / self.config.control_rate, begins))
+        self._arm.send(Target(tuple(target.tolist()), 1 / self.config.control_rate, velocity, begins))
 
     @property
     def _is_stop_due(self) -> bool:
         """Whether the arm may have stopped since its last state, for want of actions."""
-        return time.monotonic() - self._sent_at >= self.config.stop_after
+        due = self.config.stop_after + 1 / self.config.control_rate  # it holds a target for its duration first
+        return time.monotonic() - self._sent_at >= due - STOP_COMES_EARLY
+
+    def _check_gripper(self) -> None:
+        """Stop the arm where its gripper has failed."""
+        if self._gripper is not None:
+            self._gripper_position(self._gripper)
+
+    def _gripper_position(self, gripper: RobotiqGripper) -> float:
+        assert self._arm is not None
+        try:
+            return gripper.position
+        except ArmStoppedError as error:
+            reason = self._arm.failure_within(ARM_TELLS_WITHIN) or f"{error} The arm was stopped."
+            raise self._stopped(reason) from None
 
     def _stopped(self, reason: str) -> ArmStoppedError:
         """Stop the arm, and the error that says why; whatever is asked afterwards raises it, too."""
@@ -284,7 +298,8 @@ class UR5eFollower(Robot):
             logger.warning("The first target is %.2f rad away (%s): easing there in %.0f s.", distance, joint, seconds)
         for step in range(1, n_steps + 1):
             self._arm.state()  # raises where the arm has stopped
-            self._send(start + step / n_steps * (target - start), begins=True)
+            self._check_gripper()
+            self._send(start + step / n_steps * (target - start), begins=True, velocity=speed)
             time.sleep(period)
 
         settled_at = math.inf
@@ -316,6 +331,18 @@ class UR5eFollower(Robot):
         for camera in self.cameras.values():
             if camera.is_connected:
                 camera.disconnect()
+
+
+def _newest(read: Callable[[], Any]) -> Any:
+    """A camera's newest frame. After a suspension (Ctrl-Z) it is old, and the next one takes a moment."""
+    until = time.monotonic() + PICTURES_WITHIN
+    while True:
+        try:
+            return read()
+        except TimeoutError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.01)
 
 
 def _distance(state: State, target: Array) -> Array:
