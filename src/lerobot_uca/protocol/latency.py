@@ -12,10 +12,10 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_uca.features import OBS_POINT_CLOUD
-from lerobot_uca.inference.backends import EAGER
 
+EAGER = "eager"
 OF_ANY_DEVICE = (EAGER, "compile")
-"""The others compute on a CPU; on a GPU PyTorch does it for them."""
+"""The other engines compute on a CPU; on a GPU PyTorch does it for them."""
 N_WARM_UP, N_CALLS = 5, 50
 
 
