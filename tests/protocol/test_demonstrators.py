@@ -119,3 +119,9 @@ def test_joints_have_no_table_of_straight_experts(tmp_path):
 def test_a_table_needs_episodes(tmp_path):
     with pytest.raises(UserError, match="--episodes must be at least 1, got 0"):
         main(["demonstrators", "--episodes=0", f"--output={tmp_path}/table.csv"])
+
+
+def test_a_table_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"--output '.*/file/table\.csv' cannot be written"):
+        main(["demonstrators", "--tasks=reach", f"--output={tmp_path}/file/table.csv"])

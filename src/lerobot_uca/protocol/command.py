@@ -58,7 +58,7 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         "--setting", default="small", help="small, paper, a YAML file, or a run's setting.json (default: small)"
     )
     parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
-    parser.add_argument("--parallel", type=int, help="cells at once (default: one a core, or one a GPU if it computes)")
+    parser.add_argument("--parallel", type=int, help="cells at once (default: one a core, or one a GPU if one is used)")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster instead, at HOST:PORT or auto")
     where.add_argument(

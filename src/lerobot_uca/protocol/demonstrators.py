@@ -5,6 +5,7 @@ Without clouds, which no expert looks at, but for an episode's first: it takes a
 
 import csv
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -69,7 +70,8 @@ def demonstrators(tasks: Sequence[str], path: Path, how: Demonstrating, n_episod
     """
     import mujoco
 
-    _write(path, [])  # an --output that cannot be written is told at once
+    with _writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     rows: list[Demonstrator] = []
     prepared = [(task, *_of_task(task, how)) for task in tasks]  # wrong options are told at once
     for task, make_env, attempts in tqdm(prepared, desc="Experts", unit="task"):
@@ -126,10 +128,14 @@ def _of_task(task: str, how: Demonstrating) -> tuple[Callable[[], PointCloudEnv]
 
 
 def _write(path: Path, rows: Sequence[Demonstrator]) -> None:
+    with _writing(path), whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([Demonstrator._fields, *rows])
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerows([Demonstrator._fields, *rows])
+        yield
     except OSError as error:
         raise UserError(f"--output '{path}' cannot be written: {error}") from error

@@ -118,10 +118,8 @@ class RunFolder:
         """Print a line with the time, and add it to progress.log. One write: lines of several processes do not mix."""
         line = f"{datetime.now(UTC).astimezone():%Y-%m-%d %H:%M:%S} {message}"
         print(line, flush=True)
-        with (
-            suppress(OSError),
-            (self.path / "progress.log").open("a", encoding="utf-8") as file,
-        ):  # the disk may be full
+        # The disk may be full.
+        with suppress(OSError), (self.path / "progress.log").open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
 
     def read(self) -> Iterator[Row | CorruptRow]:
