@@ -2,7 +2,9 @@
 
 import threading
 
+import pytest
 import torch
+from tests.builders import make_config
 from tests.fake_cuda import moved
 from torch import nn
 
@@ -57,3 +59,13 @@ def test_cuda_graphs_belong_to_one_thread(monkeypatch, caplog):
     assert compiled_in == ["MainThread"]
     (line,) = caplog.messages
     assert line.startswith("policy.inference=compile: PyTorch keeps CUDA graphs for the thread")
+
+
+@pytest.mark.parametrize(
+    ("inference", "device", "engine"),
+    [("openvino", "cpu", "openvino"), ("openvino", "cuda:0", "eager"), ("compile", "cuda", "compile")],
+)
+def test_the_engine_is_what_computes_on_the_device(inference, device, engine):
+    config = make_config(inference=inference)
+    config.device = device
+    assert config.engine == engine

@@ -20,6 +20,8 @@ ENGINES = {
 }
 """Module and class of each backend; they compute a function of a network and of tensors, as PyTorch does."""
 BACKENDS = (EAGER, *ENGINES)
+OF_ANY_DEVICE = (EAGER, "compile")
+"""The others compute on a CPU; elsewhere PyTorch does it for them."""
 
 _warned: set[str] = set()
 

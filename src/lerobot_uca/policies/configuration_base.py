@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, POINT_CLOUD, cloud_observation, find_point_cloud
-from lerobot_uca.inference.backends import BACKENDS
+from lerobot_uca.inference.backends import BACKENDS, EAGER, OF_ANY_DEVICE
 from lerobot_uca.point_clouds.recipe import depth_keys
 from lerobot_uca.policies.augmentation_config import AugmentationConfig, SceneTurnConfig
 from lerobot_uca.policies.depth_config import DepthConfig
@@ -249,6 +249,11 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             raise UserError(
                 f"The policy's training has clouds of env.observation={trained}, the environment gives {given}: {mend}."
             )
+
+    @property
+    def engine(self) -> str:
+        """The backend that computes on this device."""
+        return self.inference if self.inference in OF_ANY_DEVICE or self.device == "cpu" else EAGER
 
     @property
     def n_channels(self) -> int:

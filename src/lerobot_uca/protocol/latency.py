@@ -13,9 +13,6 @@ from lerobot.utils.constants import OBS_STATE
 
 from lerobot_uca.features import OBS_POINT_CLOUD
 
-EAGER = "eager"
-OF_ANY_DEVICE = (EAGER, "compile")
-"""The other engines compute on a CPU; on a GPU PyTorch does it for them."""
 N_WARM_UP, N_CALLS = 5, 50
 
 
@@ -45,7 +42,7 @@ def measure(checkpoint: Path) -> dict[str, Any]:
     return {
         "median_ms": round(median(ordered), 3),
         "p90_ms": round(ordered[int(0.9 * len(ordered))], 3),
-        "engine": config.inference if config.inference in OF_ANY_DEVICE or config.device == "cpu" else EAGER,
+        "engine": config.engine,
         "device": str(config.device),
         "parameters": sum(parameter.numel() for parameter in policy.model.parameters()),
     }

@@ -89,14 +89,13 @@ def local(n_parallel: int | None = None) -> Launcher:
 
 def _places(setting: Setting) -> list[str | None]:
     """The GPU of each cell that may run at once: its name, or None where there is nothing to choose."""
-    device = setting.policy.get("device")
-    if device == "cpu":
-        return [None] * n_cores()
-    import torch
+    device, n_gpus = setting.policy.get("device"), 0
+    if device != "cpu":
+        import torch
 
-    device = device or str(torch.accelerator.current_accelerator(check_available=True))
-    n_gpus = torch.cuda.device_count()
-    if device == "None" or (device == "cuda" and not n_gpus):
+        device = device or str(torch.accelerator.current_accelerator(check_available=True) or "cpu")
+        n_gpus = torch.cuda.device_count()
+    if device == "cpu" or (device == "cuda" and not n_gpus):
         return [None] * n_cores()
     if device != "cuda":
         return [None]  # a single one, mps or cuda:1

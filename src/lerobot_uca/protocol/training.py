@@ -54,8 +54,8 @@ def collect(folder: RunFolder, cell: Cell, expert: str | None) -> Path:
                 options["successful_steps"] = folder.setting.successful_steps[cell.benchmark]
             if expert is not None and cell.benchmark == "adroit":
                 options["expert"] = expert
+            write_json(_made_by(dataset), {"expert": identity})  # before: whoever is killed then has said it
             run("lerobot-uca-collect", as_arguments(options), log=folder.cell(cell).path / "collect.log")
-            write_json(_made_by(dataset), {"expert": identity})
         elif (made := demonstrator(dataset)) not in (None, identity):
             raise CellError(f"its demonstrations are by another expert: {made}, now it is {identity}")
         return dataset
@@ -163,10 +163,14 @@ def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | 
         file.flush()
         start = file.tell()
         keep_open = () if keep is None else (keep.fileno(),)
-        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": file, "stderr": file}
-        environment = {**os.environ, **tied()}
         result = subprocess.run(  # noqa: S603
-            [*command, *arguments], **streams, env=environment, pass_fds=keep_open, check=False
+            [*command, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=file,
+            stderr=file,
+            env={**os.environ, **tied()},
+            pass_fds=keep_open,
+            check=False,
         )
     if result.returncode:
         said = _tail(log, start)

@@ -42,8 +42,8 @@ ARM_TELLS_WITHIN = 0.2
 """[s] An emergency stop takes the gripper's power, too; where that is noticed first, the arm's reason follows."""
 
 STOP_COMES_WITHIN = 3.0
-STOP_COMES_EARLY = 0.05  # [s], for the way that messages take
 """[s] The longest step of a control_rate, and a busy computer's pause."""
+STOP_COMES_EARLY = 0.05  # [s], for the way that messages take
 
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
 MEANT_IN_METRES = 2.0  # the arm reaches 0.85 m
