@@ -243,6 +243,38 @@ def test_a_note_waits_for_a_driver_that_does_not_read():
         channel.send(state)
 
 
+BROKEN_WITHIN_A_COMMAND = """
+import os, sys
+from lerobot_uca.robots.ur5e.channel import Settings
+from lerobot_uca.robots.ur5e.limits import JointLimits
+from lerobot_uca.robots.ur5e.rtde_client import ServoLoop
+
+class Control:
+    def __init__(self, real):
+        self.isConnected, self.isProgramRunning = real.isConnected, real.isProgramRunning
+
+    def kickWatchdog(self):
+        raise RuntimeError("End of file")
+
+limits = JointLimits((-6.0,) * 6, (6.0,) * 6, 1.0, 10.0, 0.1)
+settings = Settings(sys.argv[1], os.getppid(), limits, 125.0, 0.1, 300.0, 0.2)
+loop = ServoLoop(settings, type("Channel", (), {"receive": list, "send": lambda self, message: None})())
+loop._control = Control(loop._control)
+try:
+    loop.run()
+except Exception as error:
+    print(type(error).__name__, error, flush=True)
+os._exit(0)
+"""
+
+
+def test_a_connection_that_breaks_within_a_command_is_lost_too(controller):
+    """The client then raises what its sockets say, once in some hundred times: here it always does."""
+    command = [sys.executable, "-c", BROKEN_WITHIN_A_COMMAND, controller.address]
+    output = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
+    assert f"ArmStoppedError The connection to {controller.address} is lost (End of file)." in output
+
+
 class HeldArm(IdealArm):
     """An arm that leans on something."""
 

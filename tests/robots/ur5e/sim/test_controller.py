@@ -85,6 +85,7 @@ def test_a_client_moves_stops_and_starts_anew(controller):
         assert control.speedStop(10.0)
         wait_until(lambda: near(receive.getActualQd(), [0] * 6, 1e-6))
         control.stopScript()
+        wait_until(lambda: not control.isProgramRunning())  # or the client stops the one that it has just uploaded
         assert control.reuploadScript()
         wait_until(control.isProgramRunning)
         """,
