@@ -20,6 +20,7 @@ from lerobot_uca.deploy.export import export
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.errors import UserError
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 from tests.builders import N_POINTS, write_dataset
 from tests.fake_hub import running_hub
 from tests.trust.conftest import train, training_options
@@ -134,6 +135,21 @@ def test_a_push_that_fails_leaves_the_checkpoint_and_says_how_to_push_again(hub,
     ]
     assert folder.resolve().parent.name == "000002"
     assert PreTrainedConfig.from_pretrained(folder).type == "uca_flow"
+
+
+def test_a_push_that_fails_after_the_weights_says_so_too(hub, data, tmp_path, monkeypatch):
+    push_model = UCAFlowPolicy.push_model_to_hub
+
+    def push(self, *args, **kwargs):
+        push_model(self, *args, **kwargs)
+        monkeypatch.setattr(hub, "is_full", True)
+
+    monkeypatch.setattr(UCAFlowPolicy, "push_model_to_hub", push)
+    with pytest.raises(UserError, match="could not be uploaded") as error:
+        train(*options(data, tmp_path / "run", "tester/half"))
+    folder = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    assert str(error.value).startswith("Pipeline 'policy_preprocessor' is complete")
+    assert str(error.value).endswith(f"To upload it: hf upload tester/half {folder} .")
 
 
 def test_without_a_network_nothing_is_lost_either(data, tmp_path, monkeypatch):

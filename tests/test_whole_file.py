@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import signal
+import stat
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,16 @@ def test_a_block_that_writes_nothing_is_an_error(file):
     with pytest.raises(FileNotFoundError), whole_file(file):
         pass
     assert file.read_text() == "old"
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    """Root may replace /dev/null."""
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, Path("/dev/null")):
+        kind = stat.S_IFMT(path.stat().st_mode)
+        with pytest.raises(OSError, match="not a regular file"), whole_file(path) as unfinished:
+            unfinished.write_text("new")
+        assert stat.S_IFMT(path.stat().st_mode) == kind
 
 
 def test_a_folder_that_is_not_there_is_an_error_of_the_system(tmp_path):

@@ -1,5 +1,6 @@
 """Writing a file whole or not at all."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         OSError: if it cannot be written. Callers say what was to be written, and where it was asked for.
     """
+    if path.exists() and not path.is_file():  # as root, replacing /dev/null would take it from the whole machine
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
     unfinished = path.with_name(f".{path.stem}.unfinished{path.suffix}")
     try:
         yield unfinished

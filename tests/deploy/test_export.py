@@ -1,5 +1,6 @@
 """An exported file gives the policy's actions, from raw observations, with onnxruntime and numpy alone."""
 
+import itertools
 import json
 import re
 import subprocess
@@ -15,13 +16,16 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy_config, make_pre_post_processors
 from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config, make_settings
+from tests.depth_builders import make_calibration, make_camera, make_recipe
 
 from lerobot_uca.deploy import onnx_runner
 from lerobot_uca.deploy.export import export
 from lerobot_uca.deploy.onnx_runner import OnnxPolicy
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE
 from lerobot_uca.policies.augmentation_config import AugmentationConfig
+from lerobot_uca.policies.depth_config import DepthConfig
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 
@@ -101,9 +105,12 @@ def test_the_runner_acts_as_the_policy_in_lerobots_loop(tmp_path, changes, monke
     runner = OnnxPolicy(tmp_path / "policy.onnx")
     plan = runner.plan
     monkeypatch.setattr(runner, "plan", lambda clouds, states: plan(clouds, states, noise))
-    actions = np.array([runner.select_action(*observation) for observation in observations])
-    np.testing.assert_allclose(actions, actions_of_lerobots_loop(policy, tmp_path, observations, noise), atol=1e-5)
-    assert actions.shape == (7, N_ACTIONS)
+    for episode in (observations[:4], observations[3:]):  # the second remembers nothing of the first
+        actions = np.array([runner.select_action(*observation) for observation in episode])
+        np.testing.assert_allclose(actions, actions_of_lerobots_loop(policy, tmp_path, episode, noise), atol=1e-5)
+        assert actions.shape == (4, N_ACTIONS)
+        runner.reset()
+        policy.reset()
 
 
 def test_the_file_holds_the_averaged_weights_alone(checkpoint, exported):
@@ -124,8 +131,9 @@ def test_the_runner_draws_gaussian_noise_of_its_seed(exported):
     policies = [OnnxPolicy(exported, seed=seed) for seed in (3, 3, 4)]
     drawn = []
     for policy in policies:
-        policy._noise_shape = (200, 100)
-        policy._session = SimpleNamespace(run=lambda _, values: drawn.append(values["noise"]) or (np.zeros(1), 0.0))
+        policy._shapes["noise"] = (200, 100)
+        run = lambda names, values, options: drawn.append(values["noise"]) or (np.zeros(1), 0.0)  # noqa: E731
+        policy._session = SimpleNamespace(run=run)
         policy.plan(np.zeros((2, N_POINTS, 3)), np.zeros((2, N_STATES)))
     assert abs(drawn[0].mean()) < 0.03
     assert abs(drawn[0].std() - 1) < 0.03
@@ -146,6 +154,16 @@ assert not {{"torch", "lerobot", "lerobot_uca"}} & set(sys.modules)
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout) == (0, f"({N_ACTIONS},)\n"), result.stderr
+
+
+def test_a_depth_policys_file_takes_clouds_whatever_cameras_are_here(tmp_path, monkeypatch):
+    """It asks for no calibration, and other robots' do not count."""
+    make_calibration(make_camera("wrist")).write(tmp_path / "elsewhere")
+    monkeypatch.setenv(CALIBRATION_VARIABLE, str(tmp_path / "elsewhere"))
+    recipe = make_recipe().as_dict()
+    save(tmp_path, depth=DepthConfig(recipe=recipe))
+    shapes = export(str(tmp_path), tmp_path / "policy.onnx")
+    assert shapes["point_cloud"] == (2, N_POINTS, 3)
 
 
 def test_an_existing_file_is_replaced_only_when_asked_for(checkpoint, tmp_path):
@@ -201,7 +219,15 @@ def test_an_unwritable_file(checkpoint, tmp_path):
 
 
 def test_nothing_is_written_if_onnxruntime_computes_something_else(checkpoint, tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_uca.deploy.export.TOLERANCE", 0.0)  # not even rounding
+    class Other:
+        def __init__(self, *args):
+            self.session = onnx_runner.open_session(*args)
+
+        def run(self, *inputs):
+            action, largest = self.session.run(*inputs)
+            return action + 0.01, largest
+
+    monkeypatch.setattr("lerobot_uca.deploy.export.open_session", Other)
     with pytest.raises(UserError, match=r"computes other actions than the policy: .* Nothing was written"):
         export(str(checkpoint), tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
@@ -277,26 +303,29 @@ def test_further_channels_are_left_out_and_said_once(exported, caplog):
 
 
 def test_what_the_policy_refuses_the_runner_refuses(checkpoint, exported):
-    """At the same value, in normalised units: a sensor's glitch must not move a robot."""
+    """At the same value, in normalised units, and at every step: a sensor's glitch must not move a robot."""
     policy = UCAFlowPolicy.from_pretrained(checkpoint).eval()
+    assert policy.config.n_action_steps > 2
     pre, _ = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
     runner = OnnxPolicy(exported, seed=0)
     n_refused = 0
-    for size in 10.0 ** np.arange(2, 10):
-        cloud, state = np.zeros((N_POINTS, 3), np.float32), np.zeros(N_STATES, np.float32)
-        state[3] = size
+    for size, glitch in itertools.product(10.0 ** np.arange(2, 10), range(3)):
         policy.reset()
         runner.reset()
-        batch = pre({OBS_POINT_CLOUD: torch.from_numpy(cloud), "observation.state": torch.from_numpy(state)})
-        try:
-            policy.select_action(batch)
-        except UserError:
-            n_refused += 1
-            with pytest.raises(ValueError, match="unlike training's"):
+        for step in range(6):  # a plan lasts for three; what was refused is forgotten
+            cloud, state = np.zeros((N_POINTS, 3), np.float32), np.zeros(N_STATES, np.float32)
+            state[3] = size if step == glitch else 0
+            batch = pre({OBS_POINT_CLOUD: torch.from_numpy(cloud), "observation.state": torch.from_numpy(state)})
+            try:
+                policy.select_action(batch)
+            except UserError:
+                n_refused += 1
+                assert step == glitch
+                with pytest.raises(ValueError, match="unlike training's"):
+                    runner.select_action(cloud, state)
+            else:
                 runner.select_action(cloud, state)
-        else:
-            runner.select_action(cloud, state)
-    assert 0 < n_refused < 8
+    assert 0 < n_refused < 24
 
 
 class Diverged(torch.nn.Module):

@@ -3,12 +3,12 @@
 from types import SimpleNamespace
 
 import pytest
-from tests.builders import make_config
+import torch
+from tests.builders import N_POINTS, make_config
 from tests.depth_builders import make_recipe
 
 from lerobot_uca.point_clouds.depth import FAR, NEAR
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
-from lerobot_uca.policies.publishing import Evaluation
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def test_clouds_from_depth_have_their_cameras_calibrations_and_crop(published):
 
 
 def test_the_evaluations_command_names_clouds_without_the_robot(published):
-    command = "lerobot-eval --policy.path=user/name --env.type=..."
+    command = f"lerobot-eval --policy.path=user/name --env.type=... --env.n_points={N_POINTS}"
     assert f"{command} --eval.n_episodes=50" in card(published)
     published.config.observation = "object_cloud"
     assert f"{command} --env.observation=object_cloud --eval.n_episodes=50" in card(published)
@@ -39,8 +39,19 @@ def test_the_evaluations_command_names_clouds_without_the_robot(published):
 
 def test_a_known_evaluation_has_its_episodes_and_seeds(published):
     assert "not evaluated" in card(published)
-    published.evaluation = Evaluation(84.0, 50, 1000)
-    assert "- Success: 84.0 % of 50 episodes, environment seeds from 1000" in card(published)
+    published.ema_step += 2
+    published.remember_success({"overall": {"pc_success": 84.0, "n_episodes": 50}}, 1000)
+    published.ema_step += 1
+    assert "- Success: 84.0 % of 50 episodes, environment seeds from 1000, after step 2\n" in card(published)
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_page_leaves_the_policy_as_it_was(published, training):
+    published.train(training)
+    state = torch.random.get_rng_state()
+    card(published)
+    assert {module.training for module in published.modules()} == {training}
+    assert torch.equal(torch.random.get_rng_state(), state)
 
 
 def test_state_and_action_are_named_as_in_the_data(published):

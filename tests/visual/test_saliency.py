@@ -113,6 +113,41 @@ def test_clouds_of_another_kind_than_trainings(policy, checkpoint, dataset_root)
         moments_of(checkpoint, dataset_root, episode=0)
 
 
+def pointed(tmp_path, state="observation.state", n_states=N_STATES, rename_map=None):
+    """A checkpoint trained with a rename_map, and a dataset with a state of a name and size."""
+    features = {
+        OBS_POINT_CLOUD: {"dtype": "float32", "shape": (N_POINTS, 3), "names": None},
+        state: {"dtype": "float32", "shape": (n_states,), "names": None},
+        "action": {"dtype": "float32", "shape": (N_ACTIONS,), "names": None},
+    }
+    write_dataset(tmp_path / "data", features=features)
+    torch.manual_seed(0)
+    policy = UCAFlowPolicy(make_config()).eval()
+    policy.save_pretrained(tmp_path / "policy")
+    pre, post = make_pre_post_processors(policy.config, dataset_stats=make_statistics())
+    pre.steps[0].rename_map = rename_map or {}
+    pre.save_pretrained(tmp_path / "policy")
+    post.save_pretrained(tmp_path / "policy")
+    return tmp_path / "policy", tmp_path / "data"
+
+
+def test_features_are_renamed_as_in_training(tmp_path):
+    renamed = moments_of(
+        *pointed(tmp_path / "a", "observation.q", rename_map={"observation.q": "observation.state"}), 0
+    )
+    named = moments_of(*pointed(tmp_path / "b"), 0)
+    np.testing.assert_array_equal(renamed.saliency, named.saliency)
+    np.testing.assert_array_equal(renamed.states, named.states)
+
+
+def test_a_state_of_another_name_or_size(tmp_path):
+    expected = r"must have 'observation\.state' of the checkpoint's shape \(9,\), got "
+    with pytest.raises(UserError, match=expected + r"observation\.point_cloud, observation\.q, "):
+        moments_of(*pointed(tmp_path / "a", "observation.q"), 0)
+    with pytest.raises(UserError, match=expected + r"\(7,\)\."):
+        moments_of(*pointed(tmp_path / "b", n_states=7), 0)
+
+
 def test_every_ablation_has_saliency():
     for conditioning in ("cross_attention", "adaln"):
         policy = UCAFlowPolicy(make_config(conditioning=conditioning)).eval()

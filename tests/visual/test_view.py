@@ -1,5 +1,6 @@
 """Looking at clouds."""
 
+import re
 import socket
 import sys
 import urllib.request
@@ -11,6 +12,7 @@ import pytest
 import yaml
 from tests.browser import browser, needs_browser
 from tests.depth_builders import CROP, live_frame, make_calibration, make_recipe, write_depth_dataset
+from tests.forked import run_code
 from tests.robots.conftest import wait_until
 
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
@@ -19,7 +21,7 @@ from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE
 from lerobot_uca.visual import live_camera
 from lerobot_uca.visual import view as command
-from lerobot_uca.visual.crop_page import INSIDE, OUTSIDE, colours_of, write_crop
+from lerobot_uca.visual.crop_page import INSIDE, OUTSIDE, CropPage, colours_of, write_crop
 from lerobot_uca.visual.view import ViewConfig, clouds_of, record, view
 
 
@@ -50,6 +52,11 @@ def test_colours_are_the_points_own_where_they_have_some():
     points[0, 3:] = (200, 100, 0)
     np.testing.assert_array_equal(colours_of(points, CROP)[0], (200, 100, 0))
     np.testing.assert_array_equal(colours_of(points[:, :3], CROP), [INSIDE, OUTSIDE])
+
+
+def test_one_task_of_a_group_has_to_be_named():
+    with pytest.raises(UserError, match=r"One task can be viewed, got reach,push: reach, push\."):
+        next(clouds_of(ViewConfig(env=MetaworldPointCloudConfig(task="reach,push", n_points=64))))
 
 
 def test_an_environment():
@@ -123,6 +130,43 @@ def test_the_page_is_served_on_this_machine_only(depth_dataset, tmp_path):
     depth = yaml.safe_load(file.read_text())["policy"]["depth"]
     np.testing.assert_allclose(depth["crop_low"], (*CROP.low[:2], 0.1), atol=0.005)
     np.testing.assert_allclose(depth["crop_high"], CROP.high, atol=0.005)
+
+
+def write_of_page(crop: Crop, points: np.ndarray, file) -> str:
+    """What the button says, of a page that shows some points."""
+    page = CropPage(free_port(), file, crop, points)
+    try:
+        page.show(points)
+        page.write()
+        return page._status.content
+    finally:
+        page.server.stop()
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.random.default_rng(0).uniform(0, 0.5, (500, 3)),
+        np.random.default_rng(0).uniform(2, 3, (500, 3)) * [1, 1, 0],
+        np.empty((0, 3)),
+    ],
+    ids=["smaller", "elsewhere, flat", "none"],
+)
+def test_the_crop_that_is_given_is_the_one_written(points, tmp_path):
+    """Wherever an episode's points are, which may be few of those that the crop is for."""
+    pytest.importorskip("viser")
+    crop = Crop((-0.213, -0.2, -0.05), (0.901, 0.9, 0.6))
+    assert "written to" in write_of_page(crop, points.astype(np.float32), tmp_path / "mine.yaml")
+    depth = yaml.safe_load((tmp_path / "mine.yaml").read_text())["policy"]["depth"]
+    assert (tuple(depth["crop_low"]), tuple(depth["crop_high"])) == (crop.low, crop.high)
+
+
+def test_sliders_that_make_no_crop_write_none(tmp_path):
+    pytest.importorskip("viser")
+    points = np.random.default_rng(0).uniform(0, 0.5, (500, 3)).astype(np.float32)
+    said = write_of_page(Crop((0.1, 0.2, 0.3), (0.2, 0.3, 0.3)), points, tmp_path / "mine.yaml")
+    assert said.startswith("A crop has corners (x, y, z) [m], low below high in each, got")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_crop_is_written_into_a_training_configuration(tmp_path):
@@ -212,10 +256,33 @@ def test_what_cannot_be_shown_is_one_line(depth_dataset, tmp_path):
         list(view(ViewConfig(source=depth_dataset.root, crop_low=(0, 0, 0), output=tmp_path / "a.png")))
     with pytest.raises(UserError, match=r"Cannot write '.*none/a.rrd'"):
         list(view(ViewConfig(source=depth_dataset.root, rrd=tmp_path / "none" / "a.rrd")))
+    for name in (tmp_path / "folder.rrd", tmp_path / f"{'a' * 300}.rrd"):
+        (tmp_path / "folder.rrd").mkdir(exist_ok=True)
+        with pytest.raises(UserError, match=r"Cannot write '.*\.rrd': .*(not a regular file|name too long)"):
+            list(view(ViewConfig(source=depth_dataset.root, rrd=name)))
     with pytest.raises(UserError, match=r"--output needs a picture's ending, such as '.*/cloud.png'"):
         list(view(ViewConfig(source=depth_dataset.root, output=tmp_path / "cloud")))
     with pytest.raises(UserError, match="The first frame has no point"):
         command.crop_of(ViewConfig(source=depth_dataset.root), np.empty((0, 3), np.float32))
+
+
+ON_A_SMALL_DISK = """
+import resource
+from pathlib import Path
+import numpy as np
+from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.visual.view import record
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, resource.RLIM_INFINITY))
+record(Path({file!r}), iter(np.random.rand(20, 2000, 3).astype(np.float32)), Crop((-1, -1, -1), (2, 2, 2)))
+"""
+
+
+def test_a_recording_that_does_not_fit_on_the_disk_is_said(tmp_path):
+    """Rerun itself says nothing, or waits for ever."""
+    pytest.importorskip("rerun")
+    result = run_code(ON_A_SMALL_DISK.format(file=str(tmp_path / "a.rrd")))
+    assert re.search(r"UserError: Cannot write '.*a\.rrd': \[Errno 27\] File too large", result.stderr), result.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_recording_that_ends_early_is_not_left_behind(tmp_path):

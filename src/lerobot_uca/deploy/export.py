@@ -58,6 +58,7 @@ class RawPolicy:
             )
         config.device, config.inference = "cpu", "eager"  # PyTorch itself is what a trace is made of
         self.policy: PointCloudPolicy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        config.depth.know_calibrations({}, is_resumed=True)  # no robot's: a file takes clouds, not depth images
         self._pre, self._post = make_pre_post_processors(
             config,
             pretrained_path=str(folder),
@@ -161,7 +162,7 @@ def run() -> None:
     parser = argparse.ArgumentParser(
         prog="lerobot-uca-export",
         description="Write a policy as one ONNX file, normalisation included. "
-        "lerobot_uca/onnx_runner.py runs it with onnxruntime and numpy alone.",
+        "lerobot_uca/deploy/onnx_runner.py runs it with onnxruntime and numpy alone.",
     )
     parser.add_argument("checkpoint", help="folder .../pretrained_model, or a repository on the Hugging Face Hub")
     parser.add_argument("--format", choices=["onnx"], default="onnx", help="of the file (default: onnx)")

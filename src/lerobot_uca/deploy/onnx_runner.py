@@ -40,7 +40,7 @@ class OnnxPolicy:
 
     def __init__(self, path: str | Path, seed: int | None = None, n_threads: int = 1) -> None:
         self._session = open_session(Path(path).read_bytes(), str(path), n_threads)
-        shapes = {tensor.name: tuple(tensor.shape) for tensor in self._session.get_inputs()}
+        self._shapes = shapes = {tensor.name: tuple(tensor.shape) for tensor in self._session.get_inputs()}
         if set(shapes) != set(INPUTS):
             raise ValueError(f"'{path}' must have the inputs {', '.join(INPUTS)}, got {', '.join(shapes)}.")
         outputs = [tensor.name for tensor in self._session.get_outputs()]
@@ -50,7 +50,8 @@ class OnnxPolicy:
             )
         self._n_steps, *self._cloud_shape = shapes["point_cloud"]
         self._state_shape = shapes["state"][1:]
-        self._noise_shape = shapes["noise"]
+        self._run_options = onnxruntime.RunOptions()
+        self._run_options.only_execute_path_to_fetches = True  # what is largest is known long before the actions
         self._random = np.random.default_rng(seed)
         self._has_said = False
         self.reset()
@@ -64,8 +65,11 @@ class OnnxPolicy:
         """The next action (A,), from the newest point cloud and state (S,). Call it once every step.
 
         The cloud is (N, 3), or (N, 6) if the policy sees colours. The first of more channels are taken. More points
-        are sampled farthest point by farthest point, as a policy with n_points does. One without, which looks at all
-        there are, is exported for as many as training's clouds had.
+        are sampled farthest point by farthest point, as a policy with n_points does; of more than 1024 it starts from
+        another one. A policy without n_points, which looks at all there are, is exported for as many as training's
+        clouds had.
+
+        What is refused is forgotten: the next call goes on as if this one had not been.
         """
         n_channels = np.shape(point_cloud)[-1] if np.ndim(point_cloud) == 2 else 0
         if n_channels > self._cloud_shape[1] and not self._has_said:
@@ -73,6 +77,8 @@ class OnnxPolicy:
             logger.warning("The cloud has %d channels: the first %d are taken.", n_channels, self._cloud_shape[1])
         cloud = _sampled(point_cloud, *self._cloud_shape)
         frame = (_checked("point_cloud", cloud, self._cloud_shape), _checked("state", state, self._state_shape))
+        # Alone, before it is remembered: it may be executed upon only steps later, and would spoil plans until then.
+        self._run(("largest",), *(np.stack([part] * self._n_steps) for part in frame), np.zeros(self._shapes["noise"]))
         self._history.extend([frame] * (1 if self._history else self._n_steps))
         if not self._action_queue:
             clouds, states = zip(*self._history, strict=True)
@@ -88,21 +94,22 @@ class OnnxPolicy:
             noise: (T, A), Gaussian; drawn if not given.
         """
         if noise is None:
-            noise = self._random.standard_normal(self._noise_shape, dtype=np.float32)
-        values = {
-            "point_cloud": _checked("point_cloud", point_clouds, (self._n_steps, *self._cloud_shape)),
-            "state": _checked("state", states, (self._n_steps, *self._state_shape)),
-            "noise": _checked("noise", noise, self._noise_shape),
-        }
-        actions, largest = self._session.run(None, values)
+            noise = self._random.standard_normal(self._shapes["noise"], dtype=np.float32)
+        actions, _ = self._run(OUTPUTS, point_clouds, states, noise)
+        if not np.isfinite(actions).all():  # a robot must never get them
+            raise ValueError("The actions are NaN or infinite, the inputs are not: the policy's training diverged.")
+        return actions
+
+    def _run(self, outputs: tuple[str, ...], *inputs: np.ndarray) -> list[np.ndarray]:
+        """These outputs, the last of which is "largest"; that it is not too large is checked."""
+        values = {name: _checked(name, value, self._shapes[name]) for name, value in zip(INPUTS, inputs, strict=True)}
+        *others, largest = self._session.run(list(outputs), values, self._run_options)
         if not largest <= LARGEST_NORMALISED:
             raise ValueError(
                 f"The observation is unlike training's: normalised it must lie within +-{LARGEST_NORMALISED:.0e}, "
                 f"got {float(largest):.1e}. Check the sensor."
             )
-        if not np.isfinite(actions).all():  # a robot must never get them
-            raise ValueError("The actions are NaN or infinite, the inputs are not: the policy's training diverged.")
-        return actions
+        return [*others, largest]
 
 
 def open_session(model: bytes, name: str, n_threads: int = 1) -> onnxruntime.InferenceSession:

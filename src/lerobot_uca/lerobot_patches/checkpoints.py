@@ -21,7 +21,7 @@ from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.lerobot_patches.replacing import replace, replace_class_method, replace_method
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_base import load_processors
-from lerobot_uca.policies.publishing import Evaluation, PublishedPolicy
+from lerobot_uca.policies.publishing import PublishedPolicy, pushed_folder
 
 logger = logging.getLogger(__name__)
 
@@ -102,8 +102,7 @@ def _remember_success(evaluate: Callable[..., Any]) -> Callable[..., Any]:
         info = evaluate(*args, **kwargs)
         policy = kwargs.get("policy")
         if isinstance(policy, PublishedPolicy):
-            n_episodes = info["overall"]["n_episodes"]
-            policy.evaluation = Evaluation(info["overall"]["pc_success"], n_episodes, kwargs.get("start_seed"))
+            policy.remember_success(info, kwargs.get("start_seed"))
         return info
 
     return eval_policy_all
@@ -125,7 +124,7 @@ def report_failed_uploads() -> None:
 
     def processors(push: Callable[..., Any]) -> Callable[..., Any]:
         def push_to_hub(self: DataProcessorPipeline, repo_id: str, **kwargs: Any) -> Any:
-            with uploading(f"Pipeline '{self.name}'", upload_command(repo_id, Path(".../last/pretrained_model"))):
+            with uploading(f"Pipeline '{self.name}'", upload_command(repo_id, pushed_folder.get())):
                 return push(self, repo_id, **kwargs)
 
         return push_to_hub

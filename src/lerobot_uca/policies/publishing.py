@@ -1,7 +1,10 @@
 """A policy's page on the Hugging Face Hub, and its upload."""
 
 import time
+from collections.abc import Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +12,7 @@ import torch
 from huggingface_hub import ModelCard, ModelCardData
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, OBS_STATE, PRETRAINED_MODEL_DIR
+from torch import Tensor
 
 from lerobot_uca.features import OBS_POINT_CLOUD, POINT_CLOUD
 from lerobot_uca.hub import upload_command, uploading
@@ -27,6 +31,9 @@ PAPERS = {
 }
 N_TIMED = 20
 
+pushed_folder: ContextVar[Path] = ContextVar("pushed_folder", default=Path("pretrained_model"))
+"""Where the policy lies whose weights were uploaded last. LeRobot uploads its processors next and does not say of what."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -35,14 +42,20 @@ class Evaluation:
     pc_success: float
     n_episodes: int
     first_seed: int | None
+    step: int  # of the training, after which it was made
 
 
 class PublishedPolicy:
     """Uploading of a point-cloud policy; part of `PointCloudPolicy`."""
 
     config: PointCloudPolicyConfig
+    ema_step: Tensor
     evaluation: Evaluation | None = None
-    """Set by a training that evaluates."""
+
+    def remember_success(self, info: Mapping[str, Any], first_seed: int | None) -> None:
+        """Take note of an evaluation for the card, as LeRobot's `eval_policy_all` returns it."""
+        overall = info["overall"]
+        self.evaluation = Evaluation(overall["pc_success"], overall["n_episodes"], first_seed, int(self.ema_step))
 
     def push_model_to_hub(self, cfg: TrainPipelineConfig, *args: Any, **kwargs: Any) -> None:
         """Upload weights, settings and card.
@@ -53,6 +66,7 @@ class PublishedPolicy:
         output_dir = cfg.output_dir
         assert output_dir is not None
         folder = output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+        pushed_folder.set(folder)
         with uploading(f"The policy in '{folder}'", upload_command(self.config.repo_id, folder)):
             super().push_model_to_hub(cfg, *args, **kwargs)  # type: ignore[misc]
 
@@ -128,7 +142,11 @@ def _results(evaluation: Evaluation | None, cfg: TrainPipelineConfig | None, lat
     else:
         where = f" in `{cfg.env.type}` ({cfg.env.task})" if cfg is not None and cfg.env is not None else ""
         seeds = "" if evaluation.first_seed is None else f", environment seeds from {evaluation.first_seed}"
-        lines.append(f"- Success: {evaluation.pc_success:.1f} % of {evaluation.n_episodes} episodes{where}{seeds}")
+        total = "" if cfg is None else f" of {cfg.steps}"
+        lines.append(
+            f"- Success: {evaluation.pc_success:.1f} % of {evaluation.n_episodes} episodes{where}{seeds}, after step "
+            f"{evaluation.step}{total}"
+        )
     lines.append(
         f"- Latency: {latency:.1f} ms for a chunk of actions, median of {N_TIMED}, on the machine that trained it"
     )
@@ -194,6 +212,9 @@ def _commands(config: PointCloudPolicyConfig, cfg: TrainPipelineConfig | None) -
     path = config.repo_id or "user/name"
     env = cfg.env if cfg is not None else None
     environment = f"--env.type={env.type} --env.task={env.task}" if env is not None else "--env.type=..."
+    if config.depth.recipe is None and (env is None or hasattr(env, "n_points")):
+        assert config.input_features is not None
+        environment += f" --env.n_points={config.input_features[OBS_POINT_CLOUD].shape[0]}"
     if config.observation != POINT_CLOUD:
         environment += f" --env.observation={config.observation}"
     return (

@@ -8,7 +8,9 @@ import yaml
 from numpy.typing import NDArray
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.geometry import Crop
+from lerobot_uca.point_clouds.recipe import make_crop
 from lerobot_uca.whole_file import whole_file
 
 INSIDE, OUTSIDE = (33, 102, 172), (200, 200, 200)
@@ -23,7 +25,7 @@ class CropPage:
         port: of the page.
         config: training configuration that the button writes to.
         crop: to begin with.
-        points: all that will be shown, (M, 3) [m] or more channels; the sliders reach as far.
+        points: all that will be shown, (M, 3) [m] or more channels; the sliders reach as far, and as far as the crop.
 
     Raises:
         UserError: if viser is not installed.
@@ -36,9 +38,9 @@ class CropPage:
             raise UserError("The page needs viser: pip install 'lerobot_policy_uca_flow[view]'.") from error
         self.server: Any = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
         self._config, self._points = config, points[:0]
-        low = np.floor(100 * points[:, :3].min(axis=0)) / 100
-        high = np.ceil(100 * points[:, :3].max(axis=0)) / 100
-        centre, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+        seen = np.concatenate([points[:, :3], [crop.low, crop.high]])
+        low, high = np.floor(100 * seen.min(axis=0)) / 100, np.ceil(100 * seen.max(axis=0)) / 100
+        centre, diagonal = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.01)
         self._point_size = diagonal / POINTS_ACROSS
         self.server.initial_camera.look_at = centre
         self.server.initial_camera.position = centre + diagonal * np.array([-0.5, -0.5, 0.5])
@@ -48,8 +50,8 @@ class CropPage:
                 f"{side} {'xyz'[axis]} [m]",
                 min=float(low[axis]),
                 max=float(high[axis]),
-                step=0.005,
-                initial_value=float(np.clip(corner[axis], low[axis], high[axis])),
+                step=0.001,
+                initial_value=float(corner[axis]),
             )
             for side, corner in (("lowest", crop.low), ("highest", crop.high))
             for axis in range(3)
@@ -62,7 +64,7 @@ class CropPage:
 
     @property
     def crop(self) -> Crop:
-        """The crop that the sliders say."""
+        """The crop that the sliders say, which may be none: the lowest above the highest."""
         x, y, z, x_high, y_high, z_high = (round(float(slider.value), 3) for slider in self._sliders)
         return Crop((x, y, z), (x_high, y_high, z_high))
 
@@ -76,8 +78,8 @@ class CropPage:
     def write(self) -> None:
         """Write the crop to the configuration, and say so, or why not, on the page."""
         try:
-            before = write_crop(self._config, self.crop)
-        except UserError as error:
+            before = write_crop(self._config, make_crop(self.crop.low, self.crop.high))
+        except (UserError, CalibrationError) as error:
             self._status.content = str(error)
         else:
             kept = f"; as it was, with its comments, it is {before} now" if before else ""

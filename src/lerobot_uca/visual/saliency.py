@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcessorStep
 from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
 from torch import Tensor
@@ -25,6 +26,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD, cloud_observation, find_point_
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.modeling_base import PointCloudPolicy
 from lerobot_uca.policies.processor_base import PointCloudProcessorStep
+from lerobot_uca.visual.rerun_file import rerun_file
 from lerobot_uca.whole_file import whole_file
 
 N_MOMENTS = 4
@@ -63,8 +65,8 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
     """Moments of a dataset's episode, evenly spaced.
 
     Raises:
-        UserError: if the checkpoint is not one of this package, the dataset cannot be read or has no such episode, or
-            one of policy and dataset has the robot's own points and the other does not.
+        UserError: if the checkpoint is not one of this package, the dataset cannot be read, lacks what the policy sees
+            or has no such episode, or one of policy and dataset has the robot's own points and the other does not.
     """
     policy, preprocess, postprocess = _load(checkpoint)
     config = policy.config
@@ -74,25 +76,34 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
         dataset = BatchedDataset(f"local/{dataset_root.name}", root=dataset_root)
     if not 0 <= episode < dataset.num_episodes:
         raise UserError(f"--episode must be 0 to {dataset.num_episodes - 1}, got {episode}.")
-    given = cloud_observation(dataset.meta.features)
+    rename_map = _rename_map(preprocess)
+    names = {rename_map.get(name, name): name for name in dataset.meta.features}  # the dataset's, by the policy's
+    features = {name: dataset.meta.features[names[name]] for name in names}
+    given = cloud_observation(features)
     if given != config.observation:
         raise UserError(
             f"'{checkpoint}' was trained on clouds of env.observation={config.observation}, "
             f"'{dataset_root}' has {given}."
         )
     seconds = [step / dataset.fps for step in config.observation_delta_indices]
-    key = find_point_cloud(dataset.meta.features)
+    key = find_point_cloud(features)
     if key is None:
-        raise UserError(f"'{dataset_root}' must have a point cloud, got {', '.join(dataset.meta.features)}.")
-    mask = valid_mask(key, dataset.meta.features)
-    seen = [key, OBS_STATE, *([mask] if mask else [])]
+        raise UserError(f"'{dataset_root}' must have a point cloud, got {', '.join(names.values())}.")
+    state_shape = tuple(features.get(OBS_STATE, {}).get("shape", ()))
+    if state_shape != (config.n_states,):
+        raise UserError(
+            f"'{dataset_root}' must have '{OBS_STATE}' of the checkpoint's shape {(config.n_states,)}, got "
+            f"{state_shape or ', '.join(names.values())}."
+        )
+    mask = valid_mask(key, features)
+    seen = [names[name] for name in (key, OBS_STATE, *([mask] if mask else []))]
     windows = dict.fromkeys(seen, seconds)
     dataset = BatchedDataset(dataset.repo_id, root=dataset_root, delta_timestamps=windows)
     of_episode = np.flatnonzero(np.asarray(dataset.hf_dataset["episode_index"]) == episode)
     steps = np.linspace(0, len(of_episode) - 1, n_moments).round().astype(int).tolist()
     raw = default_collate(dataset.__getitems__([int(of_episode[step]) for step in steps]))
     points = PointCloudProcessorStep(config.n_points).uniform(
-        raw[key][:, -1], None if mask is None else raw[mask][:, -1]
+        raw[names[key]][:, -1], None if mask is None else raw[names[mask]][:, -1]
     )
     batch = preprocess({each: raw[each] for each in seen})
     cloud, state = batch[OBS_POINT_CLOUD], batch[OBS_STATE]
@@ -104,7 +115,7 @@ def moments_of(checkpoint: Path, dataset_root: Path, episode: int, n_moments: in
         steps=steps,
         points=points.numpy(),
         saliency=(values / values.amax(dim=1, keepdim=True).clamp_min(1e-12)).numpy(),
-        states=raw[OBS_STATE][:, -1].numpy(),
+        states=raw[names[OBS_STATE]][:, -1].numpy(),
         actions=actions.numpy(),
     )
 
@@ -119,11 +130,18 @@ def _load(checkpoint: Path) -> tuple[PointCloudPolicy, Any, Any]:
     policy_class: Any = get_policy_class(config.type)
     with redirect_stdout(None):  # LeRobot says that it loads
         policy = policy_class.from_pretrained(checkpoint, config=config).eval()
+    config.depth.know_calibrations({}, is_resumed=True)  # no robot's: clouds are given
     overrides = {"device_processor": {"device": "cpu"}}
     processors = make_pre_post_processors(
         config, pretrained_path=str(checkpoint), preprocessor_overrides=overrides, postprocessor_overrides=overrides
     )
     return policy, *processors
+
+
+def _rename_map(preprocess: PolicyProcessorPipeline) -> dict[str, str]:
+    """How the training renamed its data's features."""
+    steps = [step for step in preprocess.steps if isinstance(step, RenameObservationsProcessorStep)]
+    return {old: new for step in steps for old, new in step.rename_map.items()}
 
 
 def draw(moments: Moments, path: Path) -> None:
@@ -161,13 +179,7 @@ def draw(moments: Moments, path: Path) -> None:
 
 def record(moments: Moments, path: Path) -> None:
     """A Rerun recording: the cloud coloured by saliency, the state and the predicted chunk."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise UserError("--rerun needs Rerun: pip install 'lerobot_policy_uca_flow[rerun]'.") from error
-    recording = rerun.RecordingStream("lerobot_uca_saliency")
-    with whole_file(path) as unfinished:
-        recording.save(unfinished)
+    with rerun_file(path, "lerobot_uca_saliency") as (rerun, recording):
         for index, step in enumerate(moments.steps):
             recording.set_time("step", sequence=step)
             value = moments.saliency[index][:, None]
@@ -176,7 +188,6 @@ def record(moments: Moments, path: Path) -> None:
             recording.log(OBS_STATE.replace(".", "/"), rerun.Scalars(moments.states[index]))
             for ahead, action in enumerate(moments.actions[index]):
                 recording.log(f"{ACTION}/{ahead}_steps_ahead", rerun.Scalars(action))
-        recording.disconnect()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

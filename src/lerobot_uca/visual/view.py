@@ -29,6 +29,7 @@ from lerobot_uca.point_clouds.geometry import Crop
 from lerobot_uca.point_clouds.recipe import optional_crop
 from lerobot_uca.visual.crop_page import CropPage, colours_of
 from lerobot_uca.visual.live_camera import live_clouds
+from lerobot_uca.visual.rerun_file import rerun_file
 from lerobot_uca.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
@@ -111,7 +112,9 @@ def _first_cloud(env_config: EnvConfig, seed: int) -> NDArray[np.float32]:
     if env_config.observation == "depth":
         env_config.observation = POINT_CLOUD
     env_config.validate()
-    (task, *_) = next(iter(env_config.tasks().values()))
+    task, *others = [task for tasks in env_config.tasks().values() for task in tasks]
+    if others:
+        raise UserError(f"One task can be viewed, got {env_config.task}: {', '.join((task, *others))}.")
     env = env_config.env_factory(task)()
     return env.reset(seed=seed)[0]["point_cloud"]
 
@@ -156,20 +159,10 @@ def draw(file: Path, points: NDArray[np.float32], crop: Crop) -> None:
 
 def record(file: Path, clouds: Iterator[NDArray[np.float32]], crop: Crop) -> None:
     """A recording of all frames for Rerun."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise UserError("Recordings need rerun-sdk: pip install 'lerobot_policy_uca_flow[view]'.") from error
-    recording = rerun.RecordingStream("lerobot_uca")
-    with whole_file(file) as unfinished:
-        try:
-            recording.save(str(unfinished))
-        except (OSError, RuntimeError) as error:  # what reading the clouds raises is not about this file
-            raise UserError(f"Cannot write '{file}': {error}") from error
+    with rerun_file(file, "lerobot_uca") as (rerun, recording):
         for index, points in enumerate(clouds):
             recording.set_time("frame", sequence=index)
             recording.log("cloud", rerun.Points3D(points[:, :3], colors=colours_of(points, crop), radii=0.003))
-        recording.disconnect()
 
 
 def pages_of(config: ViewConfig, clouds: Iterator[NDArray[np.float32]]) -> Iterator[CropPage]:

@@ -126,7 +126,7 @@ class ServoLoop:
         try:
             self._serve()
         except RuntimeError as error:  # ur_rtde's, in words of its sockets: it connects anew within a command
-            raise ArmStoppedError(_lost(self._settings.ip, str(error))) from error
+            raise ArmStoppedError(f"The connection to {self._settings.ip} is lost ({error}).") from error
 
     def _serve(self) -> None:
         due = time.monotonic()
@@ -147,7 +147,7 @@ class ServoLoop:
     def _check(self) -> None:
         receive, ip = self._receive, self._settings.ip
         if not receive.isConnected() or not self._control.isConnected():
-            raise ArmStoppedError(_lost(ip, "robot switched off, cable, network"))
+            raise ArmStoppedError(f"The connection to {ip} is lost (robot switched off, cable, network).")
         if (timestamp := receive.getTimestamp()) != self._timestamp:
             self._timestamp, self._changed_at = timestamp, time.monotonic()
         if self._age > STALE_AFTER:
@@ -268,10 +268,6 @@ class ServoLoop:
                 stop_program(self._settings.ip)
                 return
             time.sleep(NEXT_DATA)
-
-
-def _lost(ip: str, why: str) -> str:
-    return f"The connection to {ip} is lost ({why})."
 
 
 def main() -> None:
