@@ -13,7 +13,7 @@ from lerobot_uca.whole_file import whole_file
 def rerun_file(path: Path, name: str) -> Iterator[tuple[Any, Any]]:
     """The module `rerun` and a `RecordingStream` that becomes a file when the block ends, whole or not at all.
 
-    The recording is kept in memory until then: Rerun's own writing to a file neither reports a full disk nor always ends on one.
+    Until then it is kept in memory: Rerun's own writing to a file neither reports a full disk nor always ends on one.
 
     Args:
         path: ends in .rrd.
