@@ -32,7 +32,7 @@ PAPERS = {
 N_TIMED = 20
 
 pushed_folder: ContextVar[Path] = ContextVar("pushed_folder", default=Path("pretrained_model"))
-"""Where the policy lies whose weights were uploaded last; LeRobot uploads its processors next and does not say whose."""
+"""Where the policy lies whose weights were uploaded last; LeRobot uploads its processors next, not saying whose."""
 
 
 @dataclass(frozen=True)

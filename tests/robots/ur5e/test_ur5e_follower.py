@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from lerobot_uca.robots.ur5e import rtde_client
 from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Note, State, decode
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
 from lerobot_uca.robots.ur5e.dashboard import Dashboard
+from lerobot_uca.robots.ur5e.gripper import RobotiqGripper
 from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_from_vector, pose_to_vector, rotation_matrix
 from lerobot_uca.robots.ur5e.sim.controller import Controller
 from lerobot_uca.robots.ur5e.sim.gripper import CLOSED_COUNT, OPEN_COUNT
@@ -478,7 +480,7 @@ def test_an_arm_that_does_not_follow_is_not_led_on(tmp_path):
         robot = make_robot(controller, tmp_path, gripper="none")
         with robot:
             robot.send_action(dict(zip(JOINT_KEYS, HOME, strict=True)))
-            with pytest.raises(ArmStoppedError, match=r"does not follow, it is 0\.2\d rad behind: the speed slider"):
+            with pytest.raises(ArmStoppedError, match=r"does not follow, it is 0\.1\d rad behind: the speed slider"):
                 stream(robot, 0.3, seconds=4)
 
 
@@ -730,11 +732,12 @@ def test_a_gripper_with_a_fault_is_refused(controller, tmp_path):
         make_robot(controller, tmp_path).connect()
 
 
-def test_a_gripper_that_does_not_become_active_is_said(controller, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("status", "said"), [(1, "did not reset itself"), (0, "did not become active")])
+def test_a_gripper_that_does_not_become_active_is_said(status, said, controller, tmp_path, monkeypatch):
     monkeypatch.setattr("lerobot_uca.robots.ur5e.gripper.ACTIVATION_TIMEOUT", 0.2)
     registers = controller.gripper.get
-    controller.gripper.get = lambda name: 1 if name == "STA" else registers(name)
-    with pytest.raises(UserError, match="did not become active"):
+    controller.gripper.get = lambda name: status if name == "STA" else registers(name)
+    with pytest.raises(UserError, match=said):
         make_robot(controller, tmp_path).connect()
     assert controller.robot.runtime == Runtime.STOPPED
 
@@ -763,6 +766,102 @@ def test_disconnecting_stops_the_fingers(controller, tmp_path):
     assert stopped < CLOSED_COUNT
     time.sleep(0.3)
     assert controller.gripper.get("POS") == stopped
+
+
+def test_a_second_interrupt_stops_the_fingers_too(controller, tmp_path, monkeypatch):
+    robot = make_robot(controller, tmp_path)
+    robot.connect()
+    robot.send_action(action_at(HOME, gripper=1.0))
+    wait_until(lambda: controller.gripper.get("POS") > OPEN_COUNT)
+    stop = robot._arm.stop
+
+    def interrupted(reason):
+        stop(reason)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(robot._arm, "stop", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        robot.disconnect()
+    stopped = controller.gripper.get("POS")
+    assert stopped < CLOSED_COUNT
+    time.sleep(0.3)
+    assert controller.gripper.get("POS") == stopped
+    assert not robot.is_connected
+
+
+def test_a_gripper_is_activated_once_it_has_reset_itself(controller, monkeypatch):
+    """Which takes a moment, before which it misses that it is activated."""
+    status, ready_at, get = 1, math.inf, controller.gripper.get
+
+    def slow_set(name, value):
+        nonlocal status, ready_at
+        if (name, value) == ("ACT", 0):
+            ready_at = time.monotonic() + 0.2
+        elif (name, value) == ("ACT", 1):
+            status = 3 if time.monotonic() > ready_at else 0
+
+    def slow_get(name):
+        if name == "STA":
+            return 0 if status == 1 and time.monotonic() > ready_at else status
+        return get(name)
+
+    monkeypatch.setattr(controller.gripper, "set", slow_set)
+    monkeypatch.setattr(controller.gripper, "get", slow_get)
+    RobotiqGripper(controller.address).close()
+    assert status == 3
+
+
+CONNECTING = """
+import os, signal, sys
+from lerobot_uca.robots.ur5e.channel import Settings
+from lerobot_uca.robots.ur5e.limits import JointLimits
+from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
+limits = JointLimits((-6.0,) * 6, (6.0,) * 6, 1.0, 5.0, 0.2)
+print("connects", flush=True)
+RtdeProcess(Settings(sys.argv[1], os.getpid(), limits, 125, 0.1, 300, 2))
+"""
+
+
+def has_ended(process: int) -> bool:
+    """Also where nobody asks how."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2].startswith("Z")
+    except FileNotFoundError:
+        return True
+
+
+@pytest.mark.parametrize("ends", [[signal.SIGINT, signal.SIGINT], [signal.SIGKILL]])
+def test_a_connection_that_is_given_up_starts_no_program_later(controller, ends):
+    """However impatiently: ur_rtde waits for ever for a controller's first data."""
+    controller.network.is_silent = True
+    command = [sys.executable, "-c", CONNECTING, controller.address]
+    driver = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert driver.stdout is not None
+    driver.stdout.readline()
+    children = Path(f"/proc/{driver.pid}/task/{driver.pid}/children")
+    wait_until(lambda: children.read_text().strip())
+    client = int(children.read_text())
+    time.sleep(2)  # until it waits
+    for each in ends:
+        driver.send_signal(each)
+        time.sleep(0.7)
+    driver.wait(10)
+    wait_until(lambda: has_ended(client), 2)
+    controller.network.is_silent = False
+    assert controller.robot.runtime == Runtime.STOPPED
+
+
+def test_a_speed_slider_below_its_end_is_said(controller, tmp_path, caplog):
+    controller.robot.speed_slider = 0.5
+    with make_robot(controller, tmp_path, gripper="none"):
+        wait_until(lambda: "The pendant's speed slider is at 50%" in caplog.text)
+
+
+def test_nothing_is_imported_from_the_working_directory(controller, tmp_path, monkeypatch):
+    (tmp_path / "json.py").write_text("raise SystemExit(3)\n")
+    monkeypatch.chdir(tmp_path)
+    with make_robot(controller, tmp_path, gripper="none") as robot:
+        assert robot.get_observation()
 
 
 def test_a_firmware_that_was_not_tried_is_said_and_works(tmp_path, caplog):

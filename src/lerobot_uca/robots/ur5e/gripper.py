@@ -13,7 +13,7 @@ PORT = 63352
 TIMEOUT = 2.0  # [s]
 ANSWERS_WITHIN = 0.5  # [s], after a suspension, in which what was heard last has become old
 ACTIVATION_TIMEOUT = 10.0  # [s]; the fingers move through their whole range meanwhile
-ACTIVE = 3  # of STA
+RESET, ACTIVE = 0, 3  # of STA
 HEALTH_PERIOD = 0.1  # [s]
 OPEN_COUNT, CLOSED_COUNT = 3, 230  # where a 2F-85's fingers end, of 0 to 255
 
@@ -64,14 +64,19 @@ class RobotiqGripper:
     def _activate(self) -> None:
         if self._get("STA") != ACTIVE:
             logger.info("The gripper is activated: its fingers open and close once.")
-            for request in ("SET ACT 0", "SET ATR 0", "SET ACT 1"):
+            for request in ("SET ACT 0", "SET ATR 0"):
                 self._ask(request)
-            deadline = time.monotonic() + ACTIVATION_TIMEOUT
-            while self._get("STA") != ACTIVE:
-                if time.monotonic() > deadline:
-                    raise UserError(f"The gripper did not become active within {ACTIVATION_TIMEOUT:.0f} s.")
-                time.sleep(0.05)
+            self._wait_for(RESET, "reset itself")  # or it would miss that it is activated
+            self._ask("SET ACT 1")
+            self._wait_for(ACTIVE, "become active")
         self._check_health()
+
+    def _wait_for(self, status: int, what: str) -> None:
+        deadline = time.monotonic() + ACTIVATION_TIMEOUT
+        while self._get("STA") != status:
+            if time.monotonic() > deadline:
+                raise UserError(f"The gripper did not {what} within {ACTIVATION_TIMEOUT:.0f} s.")
+            time.sleep(0.05)
 
     def _check_health(self) -> None:
         if fault := self._get("FLT"):

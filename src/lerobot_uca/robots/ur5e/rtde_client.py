@@ -8,12 +8,14 @@ without ur_rtde's own cleaning up, where something is wrong.
 """
 
 import contextlib
+import ctypes
 import os
 import signal
 import socket
 import sys
 import time
 from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -35,17 +37,19 @@ from lerobot_uca.robots.ur5e.kinematics import Array
 from lerobot_uca.robots.ur5e.limits import Interpolator
 from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 
-# [s] Without new data from the controller: first the setpoint stays where it is, then this ends. A busy computer may
+# [s] Without new data from the controller: first nothing is commanded, then this ends. A busy computer may
 # well wait for half a second, and its arm stands still meanwhile.
 FREEZE_AFTER, STALE_AFTER = 0.05, 1.0
-PACKETS = 3  # that may be missing before the setpoint stays, where they come more slowly than that
+PACKETS = 3  # that may be missing before that, where they come more slowly than that
 SAFEGUARD_STOP = 5  # RTDE's safety_mode
 STOPPED, PAUSED = 1, {3, 4, 5}  # RTDE's runtime_state; the latter are pausing, paused, resuming
 PAUSES_WITHIN = 0.5  # [s]
-FOLLOWS_WITHIN = 0.1  # [rad], besides what a setpoint is ahead by servoj's nature
+FOLLOWS_WITHIN = 0.1  # [rad], besides what a moving setpoint is ahead by servoj's nature
 NEXT_DATA = 0.05  # [s]
 WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
-BRAKING = 4.0  # [rad/s^2], of servoStop
+FULL_SPEED = 0.99  # of the pendant's speed slider
+SET_DEATH_SIGNAL = 1  # of prctl
+BRAKING = 4.0  # [m/s^2], of servoStop: ur_rtde's script stops the tool along its path
 
 
 class Channel:
@@ -116,10 +120,12 @@ class ServoLoop:
         self._timestamp, self._changed_at = -1.0, time.monotonic()
         self._interpolator = Interpolator(np.array(self._receive.getActualQ()), settings.limits)
         self._is_servoing = False
-        self._idle_since = self._commanded_at = time.monotonic()
-        self._was_stale = False
+        self._idle_since = self._last_turn = time.monotonic()
+        self._holds_until: float | None = None
         if not self._control.setWatchdog(WATCHDOG_RATE):
             raise ArmStoppedError(f"The program on {settings.ip} did not take its watchdog; nothing has moved.")
+        if (slider := self._receive.getTargetSpeedFraction()) < FULL_SPEED:
+            channel.send(Note(f"The pendant's speed slider is at {slider:.0%}: below 100 % the arm falls behind."))
 
     def run(self) -> None:
         """Until the driver says stop or is gone. Raises `ArmStoppedError` where the arm cannot go on."""
@@ -164,7 +170,10 @@ class ServoLoop:
         if receive.getRuntimeState() in PAUSED:
             raise ArmStoppedError("The program on the controller was paused on the pendant.")
         if not self._control.isProgramRunning():
-            raise ArmStoppedError("The program on the controller was stopped: on the pendant, or by another client.")
+            raise ArmStoppedError(
+                "The program on the controller was stopped: on the pendant, by another client, or by its watchdog, "
+                "which had not heard from this computer for a second."
+            )
 
     def _check_again(self) -> None:
         """A command was refused: what has just happened comes with the next data."""
@@ -193,33 +202,37 @@ class ServoLoop:
             self.brake()
             self._channel.send(Note(f"No action for {idle:.1f} s: the arm has stopped, the next action eases in."))
         if not self._is_servoing:
-            self._commanded_at = time.monotonic()
+            self._last_turn = time.monotonic()
             self._control.kickWatchdog()
             return
         settings = self._settings
         q = self._next_setpoint()
+        if q is None:
+            return
         if not self._control.servoJ(q.tolist(), 0.0, 0.0, self._period, settings.lookahead, settings.gain):
             self._check_again()
             raise ArmStoppedError("The controller did not take a target: its program is not running.")
 
-    def _next_setpoint(self) -> Array:
-        """The next one (6,), within the limits also of where the controller is.
+    def _next_setpoint(self) -> Array | None:
+        """The next one (6,), within the limits also of where the controller is; None for none.
 
         What is commanded while the network is silent comes late or never, and nothing is commanded while this process
-        is suspended. Going on from the last setpoint would be a jump: it goes on from where the controller stands.
+        is suspended. Going on from the last setpoint would be a jump. So nothing is commanded until data have come for
+        a while: the first may have waited somewhere, or be read half. Then it goes on from where the controller stands.
         """
         patience, now = max(FREEZE_AFTER, PACKETS * self._period), time.monotonic()
-        is_stale, was_stale = self._age > patience, self._was_stale
-        has_paused = now - self._commanded_at > patience
-        self._was_stale, self._commanded_at = is_stale, now
-        if is_stale:
-            return self._interpolator.q
-        if was_stale or has_paused:
+        if self._age > patience or now - self._last_turn > patience:
+            self._holds_until = now + patience
+        self._last_turn = now
+        if self._holds_until is not None:
+            if now < self._holds_until:
+                return None
+            self._holds_until = None
             self._interpolator.go_on_from(np.array(self._receive.getTargetQ()))
         q = self._interpolator.step(self._period)
         settings = self._settings
         behind = float(np.abs(q - np.array(self._receive.getActualQ())).max())
-        if behind > FOLLOWS_WITHIN + settings.limits.velocity * (settings.lookahead + patience):
+        if behind > FOLLOWS_WITHIN + np.abs(self._interpolator.qd).max() * (settings.lookahead + patience):
             raise ArmStoppedError(
                 f"The arm does not follow, it is {behind:.2f} rad behind: the speed slider below 100 %, reduced mode, "
                 "or something holds it."
@@ -270,6 +283,20 @@ class ServoLoop:
             time.sleep(NEXT_DATA)
 
 
+@contextlib.contextmanager
+def killed_with(parent: int) -> Iterator[None]:
+    """Let this process be killed when the one that started it ends, where the system can do that (Linux)."""
+    prctl = getattr(ctypes.CDLL(None), "prctl", None)
+    if prctl is None:
+        yield
+        return
+    prctl(SET_DEATH_SIGNAL, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(0)
+    yield
+    prctl(SET_DEATH_SIGNAL, 0)
+
+
 def main() -> None:
     """Runs until the driver stops it."""
     prefer_this_thread()
@@ -278,7 +305,10 @@ def main() -> None:
     loop = None
     failure: Failure | None = None
     try:
-        loop = ServoLoop(channel.receive_settings(), channel)
+        settings = channel.receive_settings()
+        # ur_rtde waits for ever for the first data, and would then start its program for nobody.
+        with killed_with(settings.parent):
+            loop = ServoLoop(settings, channel)
         loop.run()
     except ArmStoppedError as error:
         failure = Failure(str(error))

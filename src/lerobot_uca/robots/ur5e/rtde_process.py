@@ -49,7 +49,8 @@ class RtdeProcess:
         self._socket, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(  # noqa: S603
-                [sys.executable, "-m", "lerobot_uca.robots.ur5e.rtde_client", str(theirs.fileno())],
+                # -P: of the working directory, a recording's perhaps, nothing is imported
+                [sys.executable, "-P", "-m", "lerobot_uca.robots.ur5e.rtde_client", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,  # ur_rtde prints on both; what matters comes as messages
@@ -62,7 +63,10 @@ class RtdeProcess:
         try:
             self.wait_for(lambda _: True, START_TIMEOUT, f"An answer from {settings.ip}")
         except BaseException:
-            self.stop("The connection was given up.")
+            try:
+                self.stop("The connection was given up.")
+            finally:  # also where a second Ctrl-C comes: nothing has moved
+                self.kill()
             raise
 
     def _read(self) -> None:

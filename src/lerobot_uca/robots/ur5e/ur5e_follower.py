@@ -48,6 +48,7 @@ STOP_COMES_EARLY = 0.05  # [s], for the way that messages take
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
 MEANT_IN_METRES = 2.0  # the arm reaches 0.85 m
 GRIPPER_RANGE = (-10.0, 10.0)  # a policy that has hardly been trained may leave 0 to 1; percents go farther
+STANDS = 1e-2  # [rad/s], and no more
 ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
 SETTLING = 0.4  # [s], after which an arm whose setpoint is at the first target is as near as it gets
 NOTICEABLE_SHARE = 0.02  # of the gripper's range
@@ -308,7 +309,8 @@ class UR5eFollower(Robot):
             nonlocal settled_at
             if state.is_servoing and state.has_arrived:
                 settled_at = min(settled_at, time.monotonic() + SETTLING)
-            return time.monotonic() > settled_at or (state.is_servoing and _distance(state, target).max() < ARRIVED)
+            stands = state.is_servoing and np.abs(state.qd).max() < STANDS and _distance(state, target).max() < ARRIVED
+            return stands or time.monotonic() > settled_at
 
         try:
             timeout = 5 + speed / config.max_acceleration
@@ -322,15 +324,17 @@ class UR5eFollower(Robot):
     def disconnect(self) -> None:
         """The arm brakes and stands still, the fingers too; its program ends."""
         self._clipping.say()
-        if self._arm is not None:
-            self._arm.stop("The arm was disconnected.")
+        try:
+            if self._arm is not None:
+                self._arm.stop("The arm was disconnected.")
+        finally:  # also where a second Ctrl-C comes meanwhile
             self._arm = None
-        if self._gripper is not None:
-            self._gripper.close()
-            self._gripper = None
-        for camera in self.cameras.values():
-            if camera.is_connected:
-                camera.disconnect()
+            if self._gripper is not None:
+                self._gripper.close()
+                self._gripper = None
+            for camera in self.cameras.values():
+                if camera.is_connected:
+                    camera.disconnect()
 
 
 def _newest(read: Callable[[], Any]) -> Any:

@@ -36,6 +36,7 @@ class SimulatedGripper:
 
     def __init__(self, fingers: Fingers) -> None:
         self._fingers = fingers
+        self._status = 0
         self._registers = {"ACT": 0, "GTO": 0, "ATR": 0, "ARD": 1, "SPE": 255, "FOR": 0, "FLT": 0, "PRE": 0}
         self._commanded = fingers.count
         self._blocked_for = 0.0  # [s]
@@ -55,7 +56,7 @@ class SimulatedGripper:
         if name == "POS":
             return round(min(max(self._fingers.count, 0), 255))
         if name == "STA":
-            return 3 if self._registers["ACT"] else 0
+            return self._status
         return self._object if name == "OBJ" else self._registers.get(name, 0)
 
     def fingers_were_opened(self) -> None:
@@ -64,6 +65,7 @@ class SimulatedGripper:
 
     def cycle(self, dt: float) -> None:
         """Some time of the gripper."""
+        self._status = 3 if self._registers["ACT"] else 0  # later than it is told, as the real one
         if self._registers["ACT"] and self._registers["GTO"]:
             wanted = min(max(self._registers["PRE"], OPEN_COUNT), CLOSED_COUNT)
             step = (SLOWEST + (FASTEST - SLOWEST) * self._registers["SPE"] / 255) * dt

@@ -114,6 +114,7 @@ class Robot:
         self.lock = threading.RLock()
         self._tool_length = tool_length
         self.arm, self.clock = arm, clock
+        self.speed_slider = 1.0  # as it is shown; the arm's motion does not depend on it
         self.inputs: dict[str, Value] = {}
         self.outputs: dict[str, Value] = {"output_double_register_0": CYCLE}  # what getStepTime reads
         self.runtime, self.safety = Runtime.STOPPED, Safety.NORMAL
@@ -300,7 +301,7 @@ class Robot:
             "joint_mode": (253,) * 6,
             "safety_mode": int(self.safety),
             "speed_scaling": 1.0 if is_normal else 0.0,
-            "target_speed_fraction": 1.0,
+            "target_speed_fraction": self.speed_slider,
             "runtime_state": int(self.runtime),
             "robot_status_bits": 0b11 if is_playing else 0b1,
             "safety_status_bits": SAFETY_BITS[self.safety],
