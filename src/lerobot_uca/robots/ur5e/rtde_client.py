@@ -154,8 +154,10 @@ class ServoLoop:
         receive, ip = self._receive, self._settings.ip
         if not receive.isConnected() or not self._control.isConnected():
             raise ArmStoppedError(f"The connection to {ip} is lost (robot switched off, cable, network).")
-        if (timestamp := receive.getTimestamp()) != self._timestamp:
-            self._timestamp, self._changed_at = timestamp, time.monotonic()
+        self._hear()
+        if self._age > STALE_AFTER:
+            time.sleep(NEXT_DATA)  # a process that was suspended has not read yet
+            self._hear()
         if self._age > STALE_AFTER:
             raise ArmStoppedError(f"No data from {ip} for {self._age:.1f} s: the arm's state is unknown.")
         if receive.isEmergencyStopped():
@@ -174,6 +176,10 @@ class ServoLoop:
                 "The program on the controller was stopped: on the pendant, by another client, or by its watchdog, "
                 "which had not heard from this computer for a second."
             )
+
+    def _hear(self) -> None:
+        if (timestamp := self._receive.getTimestamp()) != self._timestamp:
+            self._timestamp, self._changed_at = timestamp, time.monotonic()
 
     def _check_again(self) -> None:
         """A command was refused: what has just happened comes with the next data."""
