@@ -132,7 +132,7 @@ def test_the_runner_draws_gaussian_noise_of_its_seed(exported):
     drawn = []
     for policy in policies:
         policy._shapes["noise"] = (200, 100)
-        run = lambda names, values, options: drawn.append(values["noise"]) or (np.zeros(1), 0.0)  # noqa: E731
+        run = lambda names, values: drawn.append(values["noise"]) or (np.zeros(1), 0.0)  # noqa: E731
         policy._session = SimpleNamespace(run=run)
         policy.plan(np.zeros((2, N_POINTS, 3)), np.zeros((2, N_STATES)))
     assert abs(drawn[0].mean()) < 0.03

@@ -50,15 +50,13 @@ class OnnxPolicy:
             )
         self._n_steps, *self._cloud_shape = shapes["point_cloud"]
         self._state_shape = shapes["state"][1:]
-        self._run_options = onnxruntime.RunOptions()
-        self._run_options.only_execute_path_to_fetches = True  # what is largest is known long before the actions
         self._random = np.random.default_rng(seed)
         self._has_said = False
         self.reset()
 
     def reset(self) -> None:
         """Forget observations and planned actions: an episode begins."""
-        self._history: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=self._n_steps)
+        self._history: list[tuple[np.ndarray, np.ndarray]] = []
         self._action_queue: deque[np.ndarray] = deque()
 
     def select_action(self, point_cloud: np.ndarray, state: np.ndarray) -> np.ndarray:
@@ -77,13 +75,16 @@ class OnnxPolicy:
             logger.warning("The cloud has %d channels: the first %d are taken.", n_channels, self._cloud_shape[1])
         cloud = _sampled(point_cloud, *self._cloud_shape)
         frame = (_checked("point_cloud", cloud, self._cloud_shape), _checked("state", state, self._state_shape))
-        # Alone, before it is remembered: it may be executed upon only steps later, and would spoil plans until then.
-        self._run(("largest",), *(np.stack([part] * self._n_steps) for part in frame), np.zeros(self._shapes["noise"]))
-        self._history.extend([frame] * (1 if self._history else self._n_steps))
-        if not self._action_queue:
-            clouds, states = zip(*self._history, strict=True)
+        if self._action_queue:  # a frame that only a later plan sees would spoil that, and be executed upon until then
+            self._run(*(np.stack([part] * self._n_steps) for part in frame), np.zeros(self._shapes["noise"]))
+        else:
+            clouds, states = zip(*self._history_with(frame), strict=True)
             self._action_queue.extend(self.plan(np.stack(clouds), np.stack(states)))
+        self._history = self._history_with(frame)
         return self._action_queue.popleft()
+
+    def _history_with(self, frame: tuple[np.ndarray, np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [*self._history[1:], frame] if self._history else [frame] * self._n_steps
 
     def plan(self, point_clouds: np.ndarray, states: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
         """Actions (n_action_steps, A), to be executed from now on, from the latest steps, oldest first.
@@ -95,21 +96,19 @@ class OnnxPolicy:
         """
         if noise is None:
             noise = self._random.standard_normal(self._shapes["noise"], dtype=np.float32)
-        actions, _ = self._run(OUTPUTS, point_clouds, states, noise)
-        if not np.isfinite(actions).all():  # a robot must never get them
-            raise ValueError("The actions are NaN or infinite, the inputs are not: the policy's training diverged.")
-        return actions
+        return self._run(point_clouds, states, noise)
 
-    def _run(self, outputs: tuple[str, ...], *inputs: np.ndarray) -> list[np.ndarray]:
-        """These outputs, the last of which is "largest"; that it is not too large is checked."""
+    def _run(self, *inputs: np.ndarray) -> np.ndarray:
         values = {name: _checked(name, value, self._shapes[name]) for name, value in zip(INPUTS, inputs, strict=True)}
-        *others, largest = self._session.run(list(outputs), values, self._run_options)
+        actions, largest = self._session.run(None, values)
         if not largest <= LARGEST_NORMALISED:
             raise ValueError(
                 f"The observation is unlike training's: normalised it must lie within +-{LARGEST_NORMALISED:.0e}, "
                 f"got {float(largest):.1e}. Check the sensor."
             )
-        return [*others, largest]
+        if not np.isfinite(actions).all():  # a robot must never get them
+            raise ValueError("The actions are NaN or infinite, the inputs are not: the policy's training diverged.")
+        return actions
 
 
 def open_session(model: bytes, name: str, n_threads: int = 1) -> onnxruntime.InferenceSession:
