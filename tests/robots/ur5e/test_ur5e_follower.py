@@ -846,7 +846,7 @@ def test_a_connection_that_is_given_up_starts_no_program_later(controller, ends)
         driver.send_signal(each)
         time.sleep(0.7)
     driver.wait(10)
-    wait_until(lambda: has_ended(client), 2)
+    wait_until(lambda: has_ended(client))
     controller.network.is_silent = False
     assert controller.robot.runtime == Runtime.STOPPED
 
