@@ -160,7 +160,7 @@ def test_the_way_to_the_first_action_is_as_slow_as_the_arm_may_be(controller, tm
         assert np.abs(controller.robot.arm.q - target).max() < 4e-3
     assert fastest(setpoints, robot) < 0.05 * 1.05
     way = (np.array(setpoints) - HOME)[:, :2]
-    np.testing.assert_allclose(way[:, 1], -way[:, 0] / 2, atol=1e-3)  # straight
+    np.testing.assert_allclose(way[:, 1], -way[:, 0] / 2, atol=5e-3)  # straight; after a pause each joint catches up
 
 
 EASING = """
