@@ -58,7 +58,7 @@ class RawPolicy:
             )
         config.device, config.inference = "cpu", "eager"  # PyTorch itself is what a trace is made of
         self.policy: PointCloudPolicy = get_policy_class(config.type).from_pretrained(folder, config=config)
-        config.depth.know_calibrations({}, is_resumed=True)  # no robot's: a file takes clouds, not depth images
+        config.depth.keep_calibrations()  # a file takes clouds, not the depth images of cameras here
         self._pre, self._post = make_pre_post_processors(
             config,
             pretrained_path=str(folder),

@@ -75,16 +75,14 @@ class OnnxPolicy:
             logger.warning("The cloud has %d channels: the first %d are taken.", n_channels, self._cloud_shape[1])
         cloud = _sampled(point_cloud, *self._cloud_shape)
         frame = (_checked("point_cloud", cloud, self._cloud_shape), _checked("state", state, self._state_shape))
+        history = [*self._history[1:], frame] if self._history else [frame] * self._n_steps
         if self._action_queue:  # a frame that only a later plan sees would spoil that, and be executed upon until then
             self._run(*(np.stack([part] * self._n_steps) for part in frame), np.zeros(self._shapes["noise"]))
         else:
-            clouds, states = zip(*self._history_with(frame), strict=True)
+            clouds, states = zip(*history, strict=True)
             self._action_queue.extend(self.plan(np.stack(clouds), np.stack(states)))
-        self._history = self._history_with(frame)
+        self._history = history
         return self._action_queue.popleft()
-
-    def _history_with(self, frame: tuple[np.ndarray, np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-        return [*self._history[1:], frame] if self._history else [frame] * self._n_steps
 
     def plan(self, point_clouds: np.ndarray, states: np.ndarray, noise: np.ndarray | None = None) -> np.ndarray:
         """Actions (n_action_steps, A), to be executed from now on, from the latest steps, oldest first.

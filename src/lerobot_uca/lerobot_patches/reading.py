@@ -77,9 +77,11 @@ def normalise_what_is_trained() -> None:
 def _begin(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:
     """Tell the policy whether this is a new training, and which calibrations depth images bring along."""
     policy.is_new_training = not config.resume
-    is_needed = isinstance(dataset, LeRobotDataset) and not (policy.depth.calibration or config.resume)  # not streamed
-    recorded = calibrations_of_depth(dataset, config.rename_map) if is_needed else {}
-    policy.depth.know_calibrations(recorded, is_resumed=config.resume)
+    if config.resume:
+        policy.depth.keep_calibrations()
+    else:
+        is_needed = isinstance(dataset, LeRobotDataset) and not policy.depth.calibration  # not streamed
+        policy.depth.know_calibrations(calibrations_of_depth(dataset, config.rename_map) if is_needed else {})
 
 
 def _normalise_by_chosen_episodes(config: TrainPipelineConfig, policy: PointCloudPolicyConfig, dataset: Any) -> None:

@@ -51,14 +51,16 @@ class DepthConfig:
         """Whether the recipe is that of a training in this process, whose clouds are to be made by it as it is."""
         return bool(self._of_data)
 
-    def know_calibrations(self, recorded: Mapping[str, Calibration], *, is_resumed: bool) -> None:
-        """Take note of the calibrations of a training's data, by camera, before it is settled.
+    def know_calibrations(self, recorded: Mapping[str, Calibration]) -> None:
+        """Take note of those that a training's data hold, by camera, before it is settled.
 
-        Args:
-            recorded: those that the dataset holds. A folder that is named counts before them.
-            is_resumed: whether the data is what the checkpoint was trained on, whose recipe holds them.
+        A folder that is named counts before them.
         """
-        self._of_data = _calibrations(self.recipe) if is_resumed else dict(recorded)
+        self._of_data = dict(recorded)
+
+    def keep_calibrations(self) -> None:
+        """Keep the recipe's: the data are those that it was made for, or clouds, which need none of this machine's."""
+        self._of_data = _calibrations(self.recipe)
 
     def settle(self, features: Features) -> CloudRecipe | None:
         """The recipe for a dataset's features, which the configuration keeps; None if it has clouds of unknown origin.

@@ -130,7 +130,7 @@ def _load(checkpoint: Path) -> tuple[PointCloudPolicy, Any, Any]:
     policy_class: Any = get_policy_class(config.type)
     with redirect_stdout(None):  # LeRobot says that it loads
         policy = policy_class.from_pretrained(checkpoint, config=config).eval()
-    config.depth.know_calibrations({}, is_resumed=True)  # no robot's: clouds are given
+    config.depth.keep_calibrations()  # clouds are given, and not by cameras here
     overrides = {"device_processor": {"device": "cpu"}}
     processors = make_pre_post_processors(
         config, pretrained_path=str(checkpoint), preprocessor_overrides=overrides, postprocessor_overrides=overrides

@@ -23,6 +23,7 @@ from tests.robots.conftest import free_address, wait_until
 from lerobot_uca.errors import UserError
 from lerobot_uca.robots.ur5e import rtde_client
 from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Note, State, decode
+from lerobot_uca.robots.ur5e.clipping_report import ClippingReport
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
 from lerobot_uca.robots.ur5e.dashboard import Dashboard
 from lerobot_uca.robots.ur5e.gripper import RobotiqGripper
@@ -30,7 +31,7 @@ from lerobot_uca.robots.ur5e.kinematics import flange_pose, pose_from_vector, po
 from lerobot_uca.robots.ur5e.sim.controller import Controller
 from lerobot_uca.robots.ur5e.sim.gripper import CLOSED_COUNT, OPEN_COUNT
 from lerobot_uca.robots.ur5e.sim.robot import Command, IdealArm, Runtime
-from lerobot_uca.robots.ur5e.ur5e_follower import GRIPPER_KEY, JOINT_KEYS, TCP_KEYS, ClippingReport, UR5eFollower
+from lerobot_uca.robots.ur5e.ur5e_follower import GRIPPER_KEY, JOINT_KEYS, TCP_KEYS, UR5eFollower
 
 pytest.importorskip("rtde_control", reason="the extra ur5e is not installed")
 
@@ -830,6 +831,20 @@ def has_ended(process: int) -> bool:
         return True
 
 
+def test_a_client_whose_driver_and_network_go_at_once_ends(controller, tmp_path):
+    """ur_rtde would wait for five minutes for the controller's answer to the command to brake."""
+    command = [sys.executable, "-c", STREAMING, controller.address, str(tmp_path)]
+    driver = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    wait_until(lambda: speed(controller) > 0.5)
+    (client,) = map(int, Path(f"/proc/{driver.pid}/task/{driver.pid}/children").read_text().split())
+    driver.kill()
+    controller.network.latency = 5.0  # what is commanded comes too late, and what it answers as well
+    driver.wait(10)
+    time.sleep(0.1)
+    controller.vanish()
+    wait_until(lambda: has_ended(client))
+
+
 @pytest.mark.parametrize("ends", [[signal.SIGINT, signal.SIGINT], [signal.SIGKILL]])
 def test_a_connection_that_is_given_up_starts_no_program_later(controller, ends):
     """However impatiently: ur_rtde waits for ever for a controller's first data."""
@@ -915,7 +930,7 @@ def test_a_missing_client_names_the_extra(controller, tmp_path, monkeypatch):
 def test_clipping_is_said_once_a_second(caplog, monkeypatch):
     caplog.set_level(logging.WARNING)
     report, now = ClippingReport(), 100.0
-    monkeypatch.setattr("lerobot_uca.robots.ur5e.ur5e_follower.time.monotonic", lambda: now)
+    monkeypatch.setattr("lerobot_uca.robots.ur5e.clipping_report.time.monotonic", lambda: now)
     for size in (0.1, 0.3, 0.2):
         report.note(np.array([0, size, 0, 0, 0, 0]))
         now += 0.4

@@ -37,8 +37,8 @@ from lerobot_uca.robots.ur5e.kinematics import Array
 from lerobot_uca.robots.ur5e.limits import Interpolator
 from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 
-# [s] Without new data from the controller: first nothing is commanded, then this ends. A busy computer may
-# well wait for half a second, and its arm stands still meanwhile.
+# [s] Without new data from the controller: first nothing is commanded, then this ends. A busy computer may well wait
+# for half a second, and its arm stands still meanwhile.
 FREEZE_AFTER, STALE_AFTER = 0.05, 1.0
 PACKETS = 3  # that may be missing before that, where they come more slowly than that
 SAFEGUARD_STOP = 5  # RTDE's safety_mode
@@ -48,6 +48,7 @@ FOLLOWS_WITHIN = 0.1  # [rad], besides what a moving setpoint is ahead by servoj
 NEXT_DATA = 0.05  # [s]
 WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
 FULL_SPEED = 0.99  # of the pendant's speed slider
+ENDS_WITHIN = 5  # [s]
 SET_DEATH_SIGNAL = 1  # of prctl
 BRAKING = 4.0  # [m/s^2], of servoStop: ur_rtde's script stops the tool along its path
 
@@ -324,6 +325,7 @@ def main() -> None:
         if failure is not None:
             channel.send(failure)
         if loop is not None:
+            signal.alarm(ENDS_WITHIN)  # kills this process: ur_rtde would wait for an answer for five minutes
             with contextlib.suppress(Exception):
                 loop.end()
         channel.finish()

@@ -18,6 +18,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.robots.camera_check import check_cameras
 from lerobot_uca.robots.realsense import connect
 from lerobot_uca.robots.ur5e.channel import ArmStoppedError, Settings, State, Target
+from lerobot_uca.robots.ur5e.clipping_report import ClippingReport
 from lerobot_uca.robots.ur5e.config_ur5e_follower import UR5eFollowerConfig
 from lerobot_uca.robots.ur5e.dashboard import check_controller
 from lerobot_uca.robots.ur5e.gripper import RobotiqGripper
@@ -51,8 +52,6 @@ GRIPPER_RANGE = (-10.0, 10.0)  # a policy that has hardly been trained may leave
 STANDS = 1e-2  # [rad/s], and no more
 ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
 SETTLING = 0.4  # [s], after which an arm whose setpoint is at the first target is as near as it gets
-NOTICEABLE_SHARE = 0.02  # of the gripper's range
-NOTICEABLE = 1e-3  # [rad]: what is clipped by less is not worth a line
 
 logger = logging.getLogger(__name__)
 
@@ -362,42 +361,3 @@ def _tool(state: State) -> Array:
     is going as it gets there.
     """
     return np.linalg.inv(flange_pose(state.q)) @ pose_from_vector(state.tcp)
-
-
-class ClippingReport:
-    """Says how much of the targets the limits have taken away, once a second: datasets hold the unclipped ones."""
-
-    def __init__(self, every: float = 1.0) -> None:
-        self._every = every
-        self._due = self._gripper_due = -math.inf
-        self._largest = np.zeros(6)
-        self._n = 0
-
-    def note(self, clipped: Array) -> None:
-        """Note the part that was taken away from a target, (6,) [rad]."""
-        if np.abs(clipped).max() > NOTICEABLE:
-            self._n += 1
-            self._largest = np.maximum(self._largest, np.abs(clipped))
-        if time.monotonic() >= self._due:
-            self.say()
-
-    def say(self) -> None:
-        """Say what has not been said yet."""
-        if self._n:
-            joint = int(self._largest.argmax())
-            logger.warning(
-                "%d targets were clipped, by up to %.3f rad (%s).", self._n, self._largest[joint], JOINTS[joint]
-            )
-            self._due, self._largest, self._n = time.monotonic() + self._every, np.zeros(6), 0
-
-    def note_gripper(self, position: float) -> None:
-        """A gripper's position, which may lie outside 0 to 1."""
-        if not -NOTICEABLE_SHARE <= position <= 1 + NOTICEABLE_SHARE and time.monotonic() >= self._gripper_due:
-            logger.warning("The gripper's position %.2f was clipped to 0 (open) to 1 (closed).", position)
-            self._gripper_due = time.monotonic() + self._every
-
-    def note_unreachable(self, pose: Array) -> None:
-        """A pose that the arm cannot take."""
-        if time.monotonic() >= self._due:
-            logger.warning("The pose %s cannot be reached; the arm holds its position.", np.round(pose[:6], 3).tolist())
-            self._due = time.monotonic() + self._every
