@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from lerobot_uca.robots.ur5e.limits import Interpolator, JointLimits, clip_target, step_towards
+from lerobot_uca.robots.ur5e.sim.motion import Servo
 
 LIMITS = JointLimits(lower=(-1.0,) * 6, upper=(1.0,) * 6, velocity=0.8, acceleration=4.0, step=0.2)
 REST = np.zeros(6)
@@ -82,12 +83,53 @@ def test_after_a_gap_it_goes_on_from_where_the_controller_stands():
     for _ in range(60):
         interpolator.step(DT)
     there = interpolator.q - 0.1  # the controller has not heard of the last ones
-    interpolator.go_on_from(there)
+    interpolator.go_on_from(there, REST, lookahead=0.1)
     path = [there, there, *(interpolator.step(DT).copy() for _ in range(200))]
     velocity = np.diff(path, axis=0) / DT
     assert np.abs(np.diff(velocity, axis=0)).max() <= LIMITS.acceleration * DT + 1e-9
     assert np.abs(velocity).max() <= LIMITS.velocity + 1e-9
     np.testing.assert_allclose(path[-1], 0.9, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", [-0.9, 0.45, 0.9], ids=["back", "short", "on"])
+@pytest.mark.parametrize("gap", [0.06, 0.1, 0.15, 0.3])
+def test_after_a_gap_an_arm_that_still_moves_brakes_no_harder_than_in_it(gap, target):
+    """In the gap the servo brakes by itself, towards the last setpoint it heard of."""
+    cycle, lookahead = 0.002, 0.1
+    interpolator, servo = Interpolator(REST, LIMITS), Servo(REST, lookahead, gain=300)
+    q, qd, path = REST, REST, [0.0]
+
+    def send_setpoints(duration):
+        for _ in range(round(duration / DT)):
+            servo.target = interpolator.step(DT)
+            coast(DT)
+
+    def coast(duration):
+        nonlocal q, qd
+        for _ in range(round(duration / cycle)):
+            q, qd = servo.step(q, qd, cycle)
+            path.append(q[0])
+
+    interpolator.set_target(np.full(6, 0.9), duration=0.1)
+    send_setpoints(0.64)
+    begin = len(path)
+    assert qd[0] > 0.7
+    coast(gap)
+    end = len(path)
+    interpolator.go_on_from(q, qd, lookahead)
+    interpolator.set_target(np.full(6, target), duration=0.1)
+    send_setpoints(3)
+    acceleration = np.abs(np.diff(path, n=2)) / cycle**2
+    assert acceleration[end - 2 :].max() < 1.1 * acceleration[begin - 2 : end - 2].max()
+    assert path[-1] == pytest.approx(target, abs=0.001)
+
+
+def test_a_gap_does_not_lead_out_of_the_range():
+    interpolator = Interpolator(REST, LIMITS)
+    interpolator.go_on_from(np.full(6, 0.98), np.full(6, 0.5), lookahead=0.1)
+    np.testing.assert_array_equal(interpolator.q, 1.0)
+    interpolator.go_on_from(np.full(6, 1.02), np.full(6, 0.5), lookahead=0.1)
+    np.testing.assert_array_equal(interpolator.q, 1.02)
 
 
 def test_a_target_may_have_a_velocity_of_its_own():

@@ -71,10 +71,14 @@ class Interpolator:
         self._start = self._target = self.q
         self._elapsed, self._duration = 0.0, 1.0
 
-    def go_on_from(self, q: Array) -> None:
-        """Stand still at q, and go from there to the target that was set."""
+    def go_on_from(self, q: Array, qd: Array, lookahead: float) -> None:
+        """Go to the target that was set from where a servo stands that has not been heard of for a while.
+
+        `servoj` compares its setpoint with q + lookahead qd: one that stands there neither brakes nor drives it, where
+        one at q would be a jump backwards (at 1 rad/s, lookahead 0.1 s and gain 300, of 30 rad/s^2).
+        """
         target = self._target
-        self.reset(q)
+        self.reset(self._inside(q + lookahead * qd, q))
         self._target = target
 
     def set_target(self, target: Array, duration: float, velocity: float = math.inf) -> None:
@@ -85,9 +89,12 @@ class Interpolator:
         """
         self._start = self._reference()
         self._now = replace(self._limits, velocity=min(velocity, self._limits.velocity))
-        lower, upper = np.minimum(self._limits.lower, self.q), np.maximum(self._limits.upper, self.q)
-        self._target = np.clip(target, lower, upper)
+        self._target = self._inside(target, self.q)
         self._elapsed, self._duration = 0.0, duration
+
+    def _inside(self, target: Array, now: Array) -> Array:
+        """The target, inside the joint range, or no farther outside it than the joints are now."""
+        return np.clip(target, np.minimum(self._limits.lower, now), np.maximum(self._limits.upper, now))
 
     def _reference(self) -> Array:
         share = min(1.0, self._elapsed / self._duration)

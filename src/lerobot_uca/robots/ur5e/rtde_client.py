@@ -227,6 +227,7 @@ class ServoLoop:
         is suspended. Going on from the last setpoint would be a jump. So nothing is commanded until data have come for
         a while: the first may have waited somewhere, or be read half. Then it goes on from where the controller stands.
         """
+        settings = self._settings
         patience, now = max(FREEZE_AFTER, PACKETS * self._period), time.monotonic()
         if self._age > patience or now - self._last_turn > patience:
             self._holds_until = now + patience
@@ -235,9 +236,9 @@ class ServoLoop:
             if now < self._holds_until:
                 return None
             self._holds_until = None
-            self._interpolator.go_on_from(np.array(self._receive.getTargetQ()))
+            q, qd = np.array(self._receive.getTargetQ()), np.array(self._receive.getTargetQd())
+            self._interpolator.go_on_from(q, qd, settings.lookahead)
         q = self._interpolator.step(self._period)
-        settings = self._settings
         behind = float(np.abs(q - np.array(self._receive.getActualQ())).max())
         if behind > FOLLOWS_WITHIN + np.abs(self._interpolator.qd).max() * (settings.lookahead + patience):
             raise ArmStoppedError(
