@@ -332,6 +332,9 @@ def test_a_configuration_is_found_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     by_name = TrainPipelineConfig.from_pretrained("uca_flow_small", cli_args=["--dataset.repo_id=test/data"])
     assert (by_name.policy.type, by_name.policy.dim, by_name.steps) == ("uca_flow", 128, 600)
+    (tmp_path / "simple_dp3_small" / "checkpoints").mkdir(parents=True)  # of a training that is called so
+    beside = TrainPipelineConfig.from_pretrained("simple_dp3_small", cli_args=["--dataset.repo_id=test/data"])
+    assert beside.policy.type == "simple_dp3"
     (tmp_path / "uca_flow_small").write_text('{"steps": 7, "dataset": {"repo_id": "test/data"}}')
     own = TrainPipelineConfig.from_pretrained("uca_flow_small", cli_args=[])
     assert own.steps == 7, "the user's own file of that name comes first"

@@ -1,6 +1,8 @@
 """The console commands. Imports are put off, because each process of `lerobot-uca-collect` loads this module again."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from lerobot_uca.processes import end_by_signals
 
@@ -11,6 +13,17 @@ def _begin() -> None:
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
+
+
+@contextmanager
+def _mistakes_in_one_line() -> Iterator[None]:
+    """For the commands that do not load the plugin, which reports them so."""
+    from lerobot_uca.errors import UserError
+
+    try:
+        yield
+    except UserError as error:
+        sys.exit(f"error: {error}")
 
 
 def _read_bare_flags() -> None:
@@ -62,7 +75,8 @@ def edit_dataset() -> None:
     end_by_signals()
     from lerobot_uca.data.edit_dataset import run
 
-    run()
+    with _mistakes_in_one_line():
+        run()
 
 
 def saliency() -> None:
@@ -89,22 +103,16 @@ def view() -> None:
 def benchmark() -> None:
     """`lerobot-uca-benchmark`."""
     end_by_signals()
-    from lerobot_uca.errors import UserError
     from lerobot_uca.protocol.command import main
 
-    try:
+    with _mistakes_in_one_line():
         main()
-    except UserError as error:
-        sys.exit(f"error: {error}")
 
 
 def ur5e_sim() -> None:
     """`lerobot-uca-ur5e-sim`."""
     end_by_signals()
-    from lerobot_uca.errors import UserError
     from lerobot_uca.robots.ur5e.sim.command import main
 
-    try:
+    with _mistakes_in_one_line():
         main()
-    except UserError as error:
-        sys.exit(f"error: {error}")

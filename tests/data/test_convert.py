@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sys
 import weakref
 from concurrent.futures import ThreadPoolExecutor
@@ -22,8 +23,10 @@ from tests.depth_builders import (
 )
 
 from lerobot_uca.data import convert as command
+from lerobot_uca.data import edit_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.convert import ConvertConfig, convert, convert_episode
+from lerobot_uca.data.sources.find import find_source
 from lerobot_uca.data.sources.lerobot_source import LOST_RECIPE
 from lerobot_uca.data.sources.source import Frame
 from lerobot_uca.errors import UserError
@@ -76,9 +79,9 @@ def test_the_new_dataset_knows_how_it_was_made_and_reads_fast(depth_dataset, tmp
     assert (dataset.num_episodes, dataset.num_frames) == (1, 6)
     info = dataset.features[OBS_POINT_CLOUD]["info"]
     assert CloudRecipe.from_dict(info[RECIPE_INFO]) == make_recipe()
-    conversion = info["conversion"]
-    assert (conversion["source"], conversion["kind"], conversion["n_points"]) == ("data", "LeRobot", N_CLOUD_POINTS)
-    assert conversion["order"] == "farthest point sampling"
+    origin = json.loads((dataset.root / "meta" / "conversion.json").read_text())
+    assert (origin["source"], origin["episodes"], origin["n_points"]) == ("data", [1], N_CLOUD_POINTS)
+    assert origin["crop_low"] == list(CROP.low)
     assert BatchedDataset("test/clouds", root=dataset.root).is_batched
 
 
@@ -172,7 +175,7 @@ def test_without_a_crop_all_points_count(tmp_path):
     write_zarr(tmp_path / "a.zarr", channels=3)
     dataset = convert(config(tmp_path / "a.zarr", tmp_path / "clouds", fps=10, crop_low=None, crop_high=None))
     assert dataset.meta.stats[OBS_POINT_CLOUD]["min"].min() < -0.05
-    assert dataset.features[OBS_POINT_CLOUD]["info"]["conversion"]["crop"] is None
+    assert json.loads((dataset.root / "meta" / "conversion.json").read_text())["crop_low"] is None
 
 
 @pytest.mark.parametrize("colours", [0, 3])
@@ -193,7 +196,9 @@ def test_the_layout_of_lerobots_open_pull_request(tmp_path, colours, caplog):
     assert "Not kept: observation.intrinsics.front, observation.extrinsics.front." in caplog.messages
 
 
-def write_with_calibration(root, pose_of=lambda index: np.array(make_camera().X_world_camera), focal_of=lambda _: 57.6):
+def write_with_calibration(
+    root, pose_of=lambda index: np.array(make_camera().X_world_camera), focal_of=lambda _: 57.6, n_episodes=1
+):
     """Depth beside its camera's calibration, in the layout of LeRobot's PR 4696."""
     camera = make_camera()
 
@@ -201,7 +206,7 @@ def write_with_calibration(root, pose_of=lambda index: np.array(make_camera().X_
         return np.array([[focal_of(index), 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
 
     columns = {"observation.intrinsics.front": intrinsics, "observation.extrinsics.front": pose_of}
-    return write_depth_dataset(root, video=False, n_episodes=1, length=3, columns=columns)
+    return write_depth_dataset(root, video=False, n_episodes=n_episodes, length=3, columns=columns)
 
 
 def test_a_calibration_beside_the_depth_is_used(tmp_path, monkeypatch, caplog):
@@ -223,6 +228,22 @@ def test_a_calibration_beside_the_depth_is_used(tmp_path, monkeypatch, caplog):
         )
 
 
+def test_episodes_in_which_the_camera_stood_elsewhere_can_be_left_out(tmp_path, monkeypatch):
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+
+    def bumped(index):
+        pose = np.array(make_camera().X_world_camera)
+        pose[0, 3] += 0.02 * (index >= 3)
+        return pose
+
+    source = write_with_calibration(tmp_path / "source", pose_of=bumped, n_episodes=2)
+    with pytest.raises(UserError, match=r"moves by 20\.0 mm and 0\.00 deg in the dataset, first in episode 1 "):
+        convert(config(source.root, tmp_path / "clouds"))
+    dataset = convert(config(source.root, tmp_path / "clouds", episodes=[1]))
+    pose = CloudRecipe.from_dict(dataset.features[OBS_POINT_CLOUD]["info"][RECIPE_INFO]).sources[0].calibration
+    np.testing.assert_allclose(pose.camera.X_world_camera, bumped(3), atol=1e-7)
+
+
 def test_a_calibration_beside_the_depth_must_be_right(tmp_path, monkeypatch):
     monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
 
@@ -232,7 +253,7 @@ def test_a_calibration_beside_the_depth_must_be_right(tmp_path, monkeypatch):
         return pose
 
     wrong = {
-        "Camera 'front' moves by 40.0 mm and 0.00 deg in the dataset": {"pose_of": moving},
+        "Camera 'front' moves by 40.0 mm and 0.00 deg in the dataset, first in episode 0 ": {"pose_of": moving},
         "observation.intrinsics.front' must be the same in all frames": {"focal_of": lambda index: 57 + index},
         "pose must hold a rotation": {"pose_of": lambda _: np.diag([2.0, 1, 1, 1])},
     }
@@ -308,6 +329,88 @@ def test_a_dataset_without_what_is_learned(tmp_path, key):
         convert(config(tmp_path / "data", tmp_path / "clouds"))
 
 
+@pytest.mark.usefixtures("calibrated")
+def test_a_damaged_video_is_one_line(tmp_path):
+    source = write_depth_dataset(tmp_path / "data", video=True, n_episodes=1)
+    (video,) = source.root.rglob("*.mp4")
+    video.write_bytes(video.read_bytes()[:300])
+    with pytest.raises(UserError, match=r"^Frame 0 of '.*data' cannot be read: \w+: ") as error:
+        convert(config(source.root, tmp_path / "clouds"))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["image", "video"])
+@pytest.mark.usefixtures("calibrated")
+def test_pictures_that_no_cloud_is_made_of_are_not_decoded(tmp_path, kind, caplog):
+    picture = {"dtype": kind, "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
+    depth = {**picture, "dtype": "image", "shape": (48, 64, 1), "info": {"is_depth_map": True}}
+    vector = {"dtype": "float32", "shape": (2,), "names": None}
+    features = {"observation.state": vector, "action": vector, "observation.images.rgb": picture, DEPTH_KEY: depth}
+    source = LeRobotDataset.create("test/both", 20, features=features, root=tmp_path / "data")
+    for index in range(3):
+        pictures = {
+            "observation.images.rgb": np.zeros((32, 48, 3), np.uint8),
+            DEPTH_KEY: live_frame(index).reshape(48, 64, 1),
+        }
+        vectors = {name: np.full(2, index, np.float32) for name in ("observation.state", "action")}
+        source.add_frame({**pictures, **vectors, "task": "push"})
+    source.save_episode()
+    source.finalize()
+    for video in (tmp_path / "data").rglob("*.mp4"):
+        video.write_bytes(b"damaged")
+    found = find_source(tmp_path / "data", CROP, "")
+    found.make_clouds((CROP.low, CROP.high), N_CLOUD_POINTS, None, [0])
+    assert "observation.images.rgb" not in found._item(0)
+    dataset = convert(config(tmp_path / "data", tmp_path / "clouds"))
+    np.testing.assert_array_equal(dataset[2][OBS_POINT_CLOUD].numpy(), make_recipe().make()([live_frame(2)]))
+    assert "Not kept: observation.images.rgb." in caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("names", "chosen", "states"),
+    [(["1", "2", "3"], [1, 2], [0, 0, 1, 1]), (["2.0", "0.0", "1.0"], [1, 2], [2, 2, 0, 0]), ("abc", [1], [1, 1])],
+)
+def test_a_folders_episodes_are_chosen_by_their_numbers(tmp_path, names, chosen, states):
+    write_folder(tmp_path / "recorded", "npz", n_frames=6)
+    rows = [f"{index}.npz,{names[index // 2]},{index // 2},0" for index in range(6)]
+    (tmp_path / "recorded" / "frames.csv").write_text("\n".join(["file,episode,state_x,action_x", *rows]) + "\n")
+    dataset = convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, episodes=chosen))
+    assert [float(dataset[index]["observation.state"]) for index in range(4)[: len(states)]] == states
+
+
+def test_episodes_that_there_are_not(tmp_path):
+    write_folder(tmp_path / "recorded", "npz")
+    for number, (names, valid) in enumerate({"34": "from 3 to 4", "25": "of 2, 5", "ab": "from 0 to 1"}.items()):
+        rows = [f"{index}.npz,{names[index // 2]},0,0" for index in range(4)]
+        (tmp_path / "recorded" / "frames.csv").write_text("\n".join(["file,episode,state_x,action_x", *rows]) + "\n")
+        with pytest.raises(UserError, match=rf"^episodes must be different ones {valid}, got \[7\]"):
+            convert(config(tmp_path / "recorded", tmp_path / f"clouds{number}", fps=5, episodes=[7]))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("file,episode,state_x,state_x,action_x\n0.npz,0,1,2,3\n", "got 'state_x' twice"), ("", "it has none")],
+)
+def test_a_frames_csv_that_would_lose_something(tmp_path, content, message):
+    write_folder(tmp_path / "recorded", "npz")
+    (tmp_path / "recorded" / "frames.csv").write_text(content)
+    with pytest.raises(UserError, match=message):
+        convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5))
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_two_conversions_can_be_merged(depth_dataset, tmp_path, monkeypatch):
+    roots = [tmp_path / "monday", tmp_path / "tuesday"]
+    for root, episodes in zip(roots, ([0], [1]), strict=True):
+        convert(config(depth_dataset.root, root, episodes=episodes))
+    paths = json.dumps([str(root) for root in roots])
+    options = ('--operation.repo_ids=["test/a", "test/b"]', f"--operation.roots={paths}", "--new_repo_id=test/both")
+    command = ["lerobot-uca-edit-dataset", "--repo_id=test/a", "--operation.type=merge", *options]
+    monkeypatch.setattr(sys, "argv", [*command, f"--new_root={tmp_path / 'both'}"])
+    edit_dataset.run()
+    assert LeRobotDataset("test/both", root=tmp_path / "both").num_episodes == 2
+
+
 @pytest.mark.parametrize("damage", ["info", "rows", "no rows"])
 def test_a_damaged_dataset_is_one_line(tmp_path, damage):
     write_dataset(tmp_path / "data")
@@ -346,6 +449,33 @@ def test_a_report_tells_what_is_wrong_and_nothing_is_written(tmp_path):
     assert "share of invalid depth or points: median 5.0%, at most 50.0%" in text
     assert "state dimensions that are constant: none" in text
     assert (tmp_path / "report" / "report.png").stat().st_size > 5000
+
+
+def test_a_report_says_where_the_points_are_that_an_empty_frame_lacks(tmp_path):
+    """One empty frame in each episode: the others tell how to move the crop."""
+    write_folder(tmp_path / "recorded", "npz")
+    for index, points in ((0, np.full((40, 3), 9.0)), (2, np.full((40, 3), 9.0))):
+        np.savez(tmp_path / "recorded" / f"{index}.npz", points=points.astype(np.float32))
+    report = {"report": tmp_path / "report", "fps": 5}
+    with pytest.raises(UserError, match="Episode 0 has 1 of 2 frames with fewer than"):
+        convert(config(tmp_path / "recorded", tmp_path / "clouds", **report))
+    (line,) = [line for line in (tmp_path / "report" / "report.txt").read_text().splitlines() if "clouds lie" in line]
+    low, high = (json.loads(part) for part in re.findall(r"\[.*?\]", line))
+    assert np.all(np.array(low) >= CROP.low)
+    assert np.all(np.array(high) <= CROP.high)
+    nowhere = {"crop_low": (-3, -3, -3), "crop_high": (-2, -2, -2)}
+    with pytest.raises(UserError, match="Episode 0 has 2 of 2"):
+        convert(config(tmp_path / "recorded", tmp_path / "clouds", **report, **nowhere))
+    assert "clouds lie in (normalisation range): nowhere" in (tmp_path / "report" / "report.txt").read_text()
+
+
+def test_a_report_that_would_be_lost_is_refused_before_the_work(tmp_path):
+    write_folder(tmp_path / "recorded", "npz")
+    (tmp_path / "file").touch()
+    for report, message in (("clouds/report", "must lie outside the new dataset"), ("file", "Cannot write the report")):
+        with pytest.raises(UserError, match=message):
+            convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, report=tmp_path / report))
+        assert not (tmp_path / "clouds").exists()
 
 
 @pytest.mark.usefixtures("calibrated")
@@ -509,11 +639,14 @@ def test_clouds_beside_the_depth_are_not_kept(tmp_path, caplog):
     assert f"Not kept: {OBS_POINT_CLOUD}." in caplog.messages
 
 
-@pytest.mark.parametrize("root", ["data/raw", "data"])
+@pytest.mark.parametrize(
+    ("root", "message"),
+    [("data/raw", r"would replace the source, '.*data/raw': name another folder"), ("data", "holds other things: raw")],
+)
 @pytest.mark.usefixtures("calibrated")
-def test_a_source_is_not_replaced(tmp_path, root):
+def test_a_source_is_not_replaced(tmp_path, root, message):
     source = write_depth_dataset(tmp_path / "data" / "raw", video=False)
-    with pytest.raises(UserError, match=r"would replace the source, '.*data/raw': name another folder"):
+    with pytest.raises(UserError, match=message):
         convert(config(source.root, tmp_path / root, overwrite=True))
     assert LeRobotDataset("test/depth", root=source.root).num_episodes == 2
 

@@ -8,6 +8,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tests.builders import write_dataset
 
+from lerobot_uca import commands
 from lerobot_uca.data.edit_dataset import run
 from lerobot_uca.features import OBS_POINT_CLOUD
 
@@ -38,6 +39,14 @@ def test_deleting_episodes(root, monkeypatch):
     options = ("--operation.episode_indices=[1]", "--new_repo_id=test/new", f"--new_root={new}")
     edit(monkeypatch, root, "delete_episodes", *options)
     assert torch.equal(clouds(new), clouds(root, [0, 2]))
+
+
+def test_a_mistake_is_one_line(root, monkeypatch, capsys):
+    arguments = ["--repo_id=test/random", f"--root={root}", "--operation.type=delete_episodes"]
+    options = ["--operation.episode_indices=[7]", "--new_repo_id=test/new", f"--new_root={root.with_name('new')}"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-uca-edit-dataset", *arguments, *options])
+    with pytest.raises(SystemExit, match=r"^error: The dataset could not be edited: ValueError: Invalid episode indi"):
+        commands.edit_dataset()
 
 
 def test_splitting(root, monkeypatch):

@@ -71,6 +71,33 @@ def test_an_overwrite_that_cannot_finish_brings_the_old_folder_back(tmp_path):
     assert content(folder) == ["data", "old"]
 
 
+def test_what_others_have_made_meanwhile_stays(tmp_path):
+    folder = tmp_path / "data"
+
+    def write_beside(**options):
+        with whole_folder(folder, **options) as unfinished:
+            unfinished.mkdir()
+            folder.mkdir()
+            (folder / "file").write_text("theirs")
+
+    with pytest.raises(UserError, match=f"'{folder}' exists"):
+        write_beside()
+    assert content(folder) == ["data", "theirs"]
+
+
+def test_a_link_to_another_disk_stays_one(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "parent").mkdir()
+    link = tmp_path / "parent" / "data"
+    link.symlink_to(tmp_path / "disk" / "data")
+    write(link, "first")
+    for text in ("second", "third"):
+        write(link, text, overwrite=True)
+        assert link.is_symlink()
+        assert content(link) == ["data", text]
+        assert content(tmp_path / "disk" / "data") == ["data", text]
+
+
 def test_a_second_run_is_refused(tmp_path):
     folder = tmp_path / "data"
     with whole_folder(folder) as unfinished:

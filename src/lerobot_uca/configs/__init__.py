@@ -7,5 +7,6 @@ NAMES = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
 
 
 def path_of(name: str) -> Path | None:
-    """The file of a configuration of this package; None for other names, and where a file or folder is called so."""
-    return FOLDER / f"{name}.yaml" if name in NAMES and not Path(name).exists() else None
+    """The file of a configuration of this package; None for other names, and for a configuration of the user's."""
+    is_users = Path(name).is_file() or Path(name, "train_config.json").is_file()
+    return FOLDER / f"{name}.yaml" if name in NAMES and not is_users else None

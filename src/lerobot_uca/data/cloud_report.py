@@ -18,7 +18,7 @@ class EpisodeReport(NamedTuple):
     episode: int
     n_points: NDArray[np.int_]  # (L,) points inside the crop, before sampling
     invalid: NDArray[np.float64]  # (L,) share of pixels without depth, or of points that are not finite
-    low: NDArray[np.float32]  # (3,) lowest corner of the sampled clouds [m]
+    low: NDArray[np.float32]  # (3,) lowest corner of the points inside the crop [m]; NaN without any
     high: NDArray[np.float32]  # (3,) highest corner [m]
     state: NDArray[np.float32]  # (L, S)
     action: NDArray[np.float32]  # (L, A)
@@ -26,7 +26,7 @@ class EpisodeReport(NamedTuple):
 
 
 def require_pictures() -> Any:
-    """The figures of matplotlib, or a `UserError`: asked for before the work, at whose end the report stands."""
+    """The figures of matplotlib, or a `UserError`."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -36,11 +36,26 @@ def require_pictures() -> Any:
     return Figure
 
 
+def prepare_report(folder: Path, root: Path) -> None:
+    """Make the folder of a report on the dataset that is to be written in `root`, at whose end the report stands.
+
+    Raises:
+        UserError: if it cannot be made, would be replaced with the dataset, or pictures cannot be drawn.
+    """
+    require_pictures()
+    if folder.resolve().is_relative_to(root.resolve()):
+        raise UserError(f"--report must lie outside the new dataset '{root}', got '{folder}'.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"Cannot write the report: {error}") from error
+
+
 def write_report(folder: Path, episodes: Sequence[EpisodeReport], least: int) -> None:
     """Write report.txt and report.png into a folder.
 
     Args:
-        folder: made if need be.
+        folder: to write into.
         episodes: at least one.
         least: a frame with fewer points is too empty.
     """
@@ -48,7 +63,6 @@ def write_report(folder: Path, episodes: Sequence[EpisodeReport], least: int) ->
     _draw(picture, episodes, least)
     text = "\n".join(summarise(episodes, least)) + "\n"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for name, content in (("report.txt", text.encode()), ("report.png", picture.getvalue())):
             with whole_file(folder / name) as unfinished:
                 unfinished.write_bytes(content)
@@ -60,15 +74,13 @@ def summarise(episodes: Sequence[EpisodeReport], least: int) -> list[str]:
     """The report's lines."""
     n_points = np.concatenate([each.n_points for each in episodes])
     invalid = np.concatenate([each.invalid for each in episodes])
-    low = np.nanmin([each.low for each in episodes], axis=0)
-    high = np.nanmax([each.high for each in episodes], axis=0)
     empty = [(each.episode, int(frame)) for each in episodes for frame in np.flatnonzero(each.n_points < least)]
     lines = [
         f"{len(episodes)} episodes, {len(n_points)} frames",
         f"points inside the crop a frame: at least {n_points.min()}, median {np.median(n_points):.0f}",
         f"frames with fewer than {least} points: {len(empty)}" + _listed("episode {} frame {}", empty),
         f"share of invalid depth or points: median {np.median(invalid):.1%}, at most {invalid.max():.1%}",
-        f"clouds lie in (normalisation range): {_numbers(low)} to {_numbers(high)} m",
+        f"clouds lie in (normalisation range): {_range(episodes)}",
     ]
     for name in ("state", "action"):
         values = np.concatenate([getattr(each, name) for each in episodes])
@@ -80,6 +92,14 @@ def summarise(episodes: Sequence[EpisodeReport], least: int) -> list[str]:
             f"{name} range: {_numbers(np.nanmin(values, axis=0))} to {_numbers(np.nanmax(values, axis=0))}",
         ]
     return lines
+
+
+def _range(episodes: Sequence[EpisodeReport]) -> str:
+    seen = [each for each in episodes if np.isfinite(each.low).all()]
+    if not seen:
+        return "nowhere, all are empty"
+    low, high = np.min([each.low for each in seen], axis=0), np.max([each.high for each in seen], axis=0)
+    return f"{_numbers(low)} to {_numbers(high)} m"
 
 
 def _listed(pattern: str, pairs: list[tuple[int, int]]) -> str:

@@ -12,18 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from huggingface_hub.errors import HFValidationError
-from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import FeatureType, parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.utils import SuppressProgressBars
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.data.demonstrations import demonstrations
+from lerobot_uca.data.new_dataset import new_dataset_root
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.envs.configs import PointCloudEnvConfig
 from lerobot_uca.envs.experts.expert import Attempt, pushed, smoothed
@@ -43,7 +42,7 @@ MAX_ATTEMPTS = 20
 class CollectConfig:
     """Make demonstrations of a simulated task with an expert, as a LeRobot dataset.
 
-    lerobot-uca-collect --env.type=metaworld_pointcloud --env.task=dial-turn --repo_id=local/dial-turn --root=data
+    lerobot-uca-collect --env.type=metaworld_pointcloud --env.task=reach --repo_id=local/reach --root=data/reach
 
     Add --env.type=... to --help to see the environment's options. With several tasks, the dataset holds all of them.
     """
@@ -75,10 +74,10 @@ class CollectConfig:
     successful_steps: int | None = within(None, least=1, most=1_000_000)
     # Successful demonstrations of each task.
     n_episodes: int = within(10, least=1, most=1_000_000)
-    # Seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of
-    # evaluation (LeRobot's start at 1000), or the policy is tested on what it has seen.
+    # Seed of the first attempt; each further attempt adds 1. Keep it away from the seeds of evaluation (LeRobot's start
+    # at 1000), or the policy is tested on what it has seen. A Minari dataset's episodes bring their own starts.
     seed: int = within(FIRST_SEED, least=0, most=2**31)
-    # Replace the folder if it exists.
+    # Replace the dataset if it exists.
     overwrite: bool = False
     # Upload the dataset to the Hugging Face Hub under repo_id.
     push_to_hub: bool = False
@@ -98,14 +97,10 @@ def collect(config: CollectConfig) -> LeRobotDataset:
     if not isinstance(env_config, PointCloudEnvConfig):
         raise UserError(f"Only point-cloud environments have a demonstrator, got env.type={env_config.type}.")
     check_bounds(config)
-    try:
-        validate_repo_id(config.repo_id)
-    except HFValidationError as error:
-        raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
+    root = new_dataset_root(config.repo_id, config.root, overwrite=config.overwrite)
     env_config.validate()
     _check_successful_steps(config, env_config)
     attempts = _attempts(config, env_config)  # before anything is written: the expert may not exist
-    root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
     with whole_folder(root, overwrite=config.overwrite) as unfinished:
         _write(config, env_config, attempts, unfinished)
     dataset = LeRobotDataset(config.repo_id, root=root)
@@ -219,6 +214,6 @@ def run(config: CollectConfig) -> None:
     """Collect and say what was collected."""
     dataset = collect(config)
     print(
-        f"{dataset.num_episodes} episodes, {dataset.num_frames} frames, seeds from {config.seed}: {dataset.root}\n"
-        f"Evaluate on other seeds (lerobot-eval uses 1000 and up)."
+        f"{dataset.num_episodes} episodes, {dataset.num_frames} frames: {dataset.root}\n"
+        f"Evaluate on other seeds than --seed={config.seed} and up (lerobot-eval uses 1000 and up)."
     )

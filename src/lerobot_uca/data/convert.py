@@ -4,29 +4,29 @@ Example:
     lerobot-uca-convert --source=data/depth --repo_id=me/clouds --crop_low='[0.2,-0.3,0.01]' --crop_high='[0.8,0.3,0.4]'
 """
 
-import importlib.metadata
+import json
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from huggingface_hub.errors import HFValidationError
-from huggingface_hub.utils import validate_repo_id
 from lerobot.configs import parser
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot.utils.utils import SuppressProgressBars
 from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_uca.bounds import check_bounds, within
-from lerobot_uca.data.cloud_report import EpisodeReport, require_pictures, write_report
+from lerobot_uca.data.cloud_report import EpisodeReport, prepare_report, write_report
+from lerobot_uca.data.new_dataset import new_dataset_root
 from lerobot_uca.data.sources.find import find_source
 from lerobot_uca.data.sources.lerobot_source import LeRobotSource
 from lerobot_uca.data.sources.source import Source
@@ -69,7 +69,7 @@ class ConvertConfig:
     colour: bool = False
     # Folder of the cameras' calibrations; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
-    # The episodes to convert, such as [0,1,5]; by default all.
+    # The episodes to convert, such as [0,1,5], by their numbers in the source; by default all.
     episodes: list[int] | None = None
     # Steps a second of a source that does not know it (zarr, PLY, NPZ).
     fps: int | None = within(None, least=1, most=10_000)
@@ -79,7 +79,7 @@ class ConvertConfig:
     num_workers: int = within(0, least=0, most=1024)
     # Write a report on the clouds' quality into this folder: report.txt and report.png.
     report: Path | None = None
-    # Replace the folder if it exists.
+    # Replace the dataset if it exists.
     overwrite: bool = False
     # Upload the dataset to the Hugging Face Hub under repo_id.
     push_to_hub: bool = False
@@ -104,21 +104,16 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
         UserError: for a source that cannot be read or does not fit, for frames with too few points, and for an upload
             that fails.
     """
-    try:
-        validate_repo_id(config.repo_id)
-    except HFValidationError as error:
-        raise UserError(f"repo_id must be 'user/name', got '{config.repo_id}'.") from error
     check_bounds(config)
+    root = new_dataset_root(config.repo_id, config.root, overwrite=config.overwrite)
     if config.report is not None:
-        require_pictures()
-    source = make_source(config)
+        prepare_report(config.report, root)
+    source, episodes = make_source(config)
     if isinstance(source, LeRobotSource) and (config.fps is not None or config.task):
         logger.warning("--fps and --task are for sources without them; a LeRobot dataset keeps its own.")
     fps = source.fps or config.fps
     if fps is None:
         raise UserError(f"'{config.source}' does not say how many steps a second it has: give --fps.")
-    episodes = _chosen(config.episodes, source.n_episodes)
-    root = Path(config.root or HF_LEROBOT_HOME / config.repo_id).absolute()
     if config.source.resolve().is_relative_to(root.resolve()):
         raise UserError(f"--root '{root}' would replace the source, '{config.source}': name another folder.")
     with whole_folder(root, overwrite=config.overwrite) as unfinished:
@@ -131,16 +126,18 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
     return dataset
 
 
-def make_source(config: ConvertConfig) -> Source:
-    """The source as configured, with its crop and, for depth, its recipe."""
+def make_source(config: ConvertConfig) -> tuple[Source, Sequence[int]]:
+    """The source as configured, with its crop and, for depth, its recipe; and its chosen episodes."""
     try:
         crop = optional_crop(config.crop_low, config.crop_high)
         source = find_source(config.source, crop, config.task, colour=config.colour)
+        episodes = source.choose(config.episodes)
         if isinstance(source, LeRobotSource) and source.has_depth:
-            source.make_clouds((crop.low, crop.high) if crop else None, config.n_points, config.calibration)
+            corners = (crop.low, crop.high) if crop else None
+            source.make_clouds(corners, config.n_points, config.calibration, episodes)
     except CalibrationError as error:
         raise UserError(str(error)) from error
-    return source
+    return source, episodes
 
 
 def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
@@ -152,13 +149,15 @@ def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
         )
     few = [index for index, frame in enumerate(frames) if frame.n_points < least_points(n_points)]
     clouds = [frame.points for frame in frames]
+    nowhere = np.full((1, 3), np.nan, np.float32)
+    seen = np.concatenate([frame.points[:, :3] for frame in frames if frame.n_points] or [nowhere])
     state, action = (np.stack([getattr(frame, name) for frame in frames]) for name in ("state", "action"))
     report = EpisodeReport(
         episode,
         n_points=np.array([frame.n_points for frame in frames]),
         invalid=np.array([frame.invalid for frame in frames]),
-        low=np.min([cloud[:, :3].min(axis=0) for cloud in clouds], axis=0),
-        high=np.max([cloud[:, :3].max(axis=0) for cloud in clouds], axis=0),
+        low=seen.min(axis=0),
+        high=seen.max(axis=0),
         state=state,
         action=action,
         seen=source.seen(episode, few[0]) if few else "",
@@ -178,25 +177,19 @@ def _sample(points: NDArray[np.float32], n_points: int) -> NDArray[np.float32]:
     return sample_farthest(points, n_points)
 
 
-def _chosen(episodes: list[int] | None, n_episodes: int) -> list[int]:
-    chosen = list(range(n_episodes)) if episodes is None else episodes
-    wrong = [episode for episode in chosen if not 0 <= episode < n_episodes]
-    if wrong or not chosen or len(set(chosen)) < len(chosen):
-        raise UserError(f"episodes must be different ones from 0 to {n_episodes - 1}, got {chosen}.")
-    return chosen
-
-
-def _write(config: ConvertConfig, source: Source, fps: int, episodes: list[int], root: Path) -> None:
+def _write(config: ConvertConfig, source: Source, fps: int, episodes: Sequence[int], root: Path) -> None:
     dataset: LeRobotDataset | None = None
     reports: list[EpisodeReport] = []
-    least = least_points(config.n_points)
+    least, first_bad = least_points(config.n_points), None
     try:
         for episode in _converted(config, source, episodes):
             reports.append(episode.report)
             if dataset is None:
                 features = _features(config, source, episode)
                 dataset = LeRobotDataset.create(config.repo_id, fps, features=features, root=root, use_videos=False)
-            if all(report.n_points.min() >= least for report in reports):
+            if first_bad is None and episode.report.n_points.min() < least:
+                first_bad = episode.report
+            if first_bad is None:
                 _add(dataset, episode)
             elif config.report is None:
                 break  # nothing will be written; a report would look at the rest, too
@@ -206,14 +199,27 @@ def _write(config: ConvertConfig, source: Source, fps: int, episodes: list[int],
     if config.report is not None:
         write_report(config.report, reports, least)
     _warn_of_nan(reports)
-    for report in reports:
-        few = np.flatnonzero(report.n_points < least)
-        if len(few):
-            raise UserError(
-                f"Episode {report.episode} has {len(few)} of {len(report.n_points)} frames with fewer than {least} "
-                f"points inside the crop, the first is frame {few[0]} with {report.n_points[few[0]]}. {report.seen}. "
-                "Move the crop, or leave the episode out with --episodes; --report=FOLDER shows all."
-            )
+    if first_bad is not None:
+        few = np.flatnonzero(first_bad.n_points < least)
+        raise UserError(
+            f"Episode {first_bad.episode} has {len(few)} of {len(first_bad.n_points)} frames with fewer than {least} "
+            f"points inside the crop, the first is frame {few[0]} with {first_bad.n_points[few[0]]}. {first_bad.seen}. "
+            "Move the crop, or leave the episode out with --episodes; --report=FOLDER shows all."
+        )
+    _write_origin(root / "meta" / "conversion.json", config, source, episodes)
+
+
+def _write_origin(file: Path, config: ConvertConfig, source: Source, episodes: Sequence[int]) -> None:
+    """Where the clouds come from. Among the features it would keep LeRobot from merging two conversions."""
+    origin = {
+        "source": source.path.resolve().name,
+        "episodes": [*episodes],
+        "crop_low": config.crop_low,
+        "crop_high": config.crop_high,
+        "n_points": config.n_points,
+        "version": version("lerobot_policy_uca_flow"),
+    }
+    file.write_text(json.dumps(origin, indent=2) + "\n", encoding="utf-8")
 
 
 def _warn_of_nan(reports: list[EpisodeReport]) -> None:
@@ -223,7 +229,7 @@ def _warn_of_nan(reports: list[EpisodeReport]) -> None:
             logger.warning("The %s of the episodes %s holds NaN or infinite values; training refuses them.", name, bad)
 
 
-def _converted(config: ConvertConfig, source: Source, episodes: list[int]) -> Iterator[Episode]:
+def _converted(config: ConvertConfig, source: Source, episodes: Sequence[int]) -> Iterator[Episode]:
     convert_one = partial(convert_episode, source, config.n_points)
     bar = partial(tqdm, total=len(episodes), desc="Converted", unit="episode")
     if config.num_workers == 0:
@@ -253,18 +259,7 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> None:
 
 def _features(config: ConvertConfig, source: Source, episode: Episode) -> dict[str, dict[str, Any]]:
     recipe = source.recipe
-    crop = source.crop
-    info: dict[str, Any] = {
-        "conversion": {
-            "source": source.path.name,
-            "kind": type(source).__name__.removesuffix("Source"),
-            "crop": [list(crop.low), list(crop.high)] if crop else None,
-            "n_points": config.n_points,
-            "order": "farthest point sampling",
-            "version": importlib.metadata.version("lerobot_policy_uca_flow"),
-        },
-        **observation_info(source.observation),
-    }
+    info: dict[str, Any] = {**observation_info(source.observation)}
     if recipe is not None:
         info[RECIPE_INFO] = replace(recipe, n_points=config.n_points).as_dict()
     return {

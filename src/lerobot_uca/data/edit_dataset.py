@@ -13,6 +13,8 @@ import pyarrow as pa
 from datasets.features import features as hf_features
 from datasets.features.features import PandasArrayExtensionArray, PandasArrayExtensionDtype
 
+from lerobot_uca.errors import reported
+
 
 def let_pandas_hold_arrays() -> None:
     """Complete the pandas type of `datasets`: it can be compared, made from its name, joined and turned into Arrow."""
@@ -48,8 +50,13 @@ def _to_arrow(self: PandasArrayExtensionArray, type: pa.DataType | None = None) 
 
 
 def run() -> None:
-    """LeRobot's command."""
+    """LeRobot's command.
+
+    Raises:
+        UserError: if it fails, with its own reason.
+    """
     from lerobot.scripts.lerobot_edit_dataset import main
 
     let_pandas_hold_arrays()
-    main()
+    with reported("The dataset could not be edited"):
+        main()

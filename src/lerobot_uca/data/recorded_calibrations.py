@@ -5,7 +5,7 @@ each frame. The world is taken for the robot's base frame.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,12 @@ STILL = (1.0, 0.1)
 """(mm, deg) A camera that moves less in a dataset is a fixed one."""
 
 
-def recorded_calibrations(dataset: Any) -> dict[str, Calibration]:
+def recorded_calibrations(dataset: Any, episodes: Sequence[int] | None = None) -> dict[str, Calibration]:
     """The calibrations of a LeRobot dataset's depth cameras that it holds itself, by the name of the camera.
+
+    Args:
+        dataset: opened.
+        episodes: that matter, of those that were opened; by default all.
 
     Raises:
         UserError: if a camera moves, or has several intrinsics.
@@ -32,7 +36,7 @@ def recorded_calibrations(dataset: Any) -> dict[str, Calibration]:
     for key in depth_keys(dataset.features):
         name = camera_of(key)
         if {INTRINSICS + name, EXTRINSICS + name} <= dataset.features.keys():
-            found[name] = _calibration(dataset, name, dataset.features[key]["shape"])
+            found[name] = _calibration(dataset, name, dataset.features[key]["shape"], episodes)
     if found:
         logger.warning(
             "Calibrations in the dataset are used: camera %s. Its world frame must be the robot's base frame.",
@@ -57,18 +61,21 @@ def calibrations_of_depth(dataset: Any, rename_map: Mapping[str, str]) -> dict[s
     return {camera_of(name): recorded[camera_of(key)] for key, name in names.items() if camera_of(key) in recorded}
 
 
-def _calibration(dataset: Any, name: str, shape: tuple[int, ...]) -> Calibration:
-    columns = dataset.hf_dataset.select_columns([INTRINSICS + name, EXTRINSICS + name]).with_format("numpy")[:]
-    K, X = (np.asarray(columns[kind + name], dtype=np.float64) for kind in (INTRINSICS, EXTRINSICS))
+def _calibration(dataset: Any, name: str, shape: tuple[int, ...], episodes: Sequence[int] | None) -> Calibration:
+    wanted = [INTRINSICS + name, EXTRINSICS + name, "episode_index"]
+    columns = dataset.hf_dataset.select_columns(wanted).with_format("numpy")[:]
+    is_chosen = np.isin(columns["episode_index"], columns["episode_index"] if episodes is None else episodes)
+    K, X = (np.asarray(columns[kind + name], dtype=np.float64)[is_chosen] for kind in (INTRINSICS, EXTRINSICS))
     if np.ptp(K, axis=0).max() > 1e-3:
         raise UserError(
             f"'{INTRINSICS}{name}' must be the same in all frames, it changes by {np.ptp(K, axis=0).max()}."
         )
-    mm, deg = np.max([pose_difference(X[0], each) for each in X], axis=0)
-    if mm > STILL[0] or deg > STILL[1]:
+    moved = np.array([pose_difference(X[0], each) for each in X])
+    if (is_off := (moved > STILL).any(axis=1)).any():
+        (mm, deg), episode = moved.max(axis=0), columns["episode_index"][is_chosen][is_off.argmax()]
         raise UserError(
-            f"Camera '{name}' moves by {mm:.1f} mm and {deg:.2f} deg in the dataset ('{EXTRINSICS}{name}'). Clouds "
-            "need a fixed camera."
+            f"Camera '{name}' moves by {mm:.1f} mm and {deg:.2f} deg in the dataset, first in episode {episode} "
+            f"('{EXTRINSICS}{name}'). Clouds need a fixed camera: choose episodes in which it stands still."
         )
     (fx, _, cx), (_, fy, cy), _ = K[0].tolist()
     height, width = shape[:2]

@@ -32,7 +32,7 @@ def whole_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
     Raises:
         UserError: if the folder exists, another process is writing it, or it cannot be written.
     """
-    folder = folder.absolute()
+    folder = folder.resolve()  # a link to another disk stays one
     try:
         _check_absent(folder, overwrite)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -43,6 +43,7 @@ def whole_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
             with TemporaryDirectory(prefix=prefix, dir=folder.parent, ignore_cleanup_errors=True) as unfinished:
                 new = Path(unfinished, folder.name)
                 yield new
+                _check_absent(folder, overwrite)  # others, who know no lock, may have made it meanwhile
                 _replace(folder, new)
     except OSError as error:
         raise UserError(f"Cannot write '{folder}': {error}") from error

@@ -96,13 +96,12 @@ def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
     assert config.source is not None
     try:
         source = find_source(config.source, None, "", colour=config.colour)
+        (episode,) = source.choose([config.episode])
         if isinstance(source, LeRobotSource) and source.has_depth:
-            source.make_clouds((WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration)
+            source.make_clouds((WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration, [episode])
     except CalibrationError as error:
         raise UserError(str(error)) from error
-    if config.episode >= source.n_episodes:
-        raise UserError(f"episode must be from 0 to {source.n_episodes - 1}, got {config.episode}.")
-    for frame in source.frames(config.episode):
+    for frame in source.frames(episode):
         yield frame.points
 
 

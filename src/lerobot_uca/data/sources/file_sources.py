@@ -65,9 +65,9 @@ class ZarrSource(Source):
         return group
 
     @property
-    def n_episodes(self) -> int:
-        """The number of episodes."""
-        return self._group[ZARR_KEYS[3]].shape[0]
+    def episodes(self) -> Sequence[int]:
+        """The episodes' numbers, from 0."""
+        return range(self._group[ZARR_KEYS[3]].shape[0])
 
     def frames(self, episode: int) -> Iterator[Frame]:
         """The steps of one episode, which is read as a whole."""
@@ -110,12 +110,16 @@ class FolderSource(Source):
         file = self.path / "frames.csv"
         try:
             with file.open(newline="", encoding="utf-8-sig") as opened:  # spreadsheets write a mark at the beginning
-                rows = list(csv.DictReader(opened))
+                table = csv.DictReader(opened)
+                rows, columns = list(table), list(table.fieldnames or ())
         except (OSError, UnicodeDecodeError, csv.Error) as error:
             raise UserError(f"'{file}' cannot be read: {error}") from error
         if uneven := [number for number, row in enumerate(rows, 2) if None in row or None in row.values()]:
             raise UserError(f"'{file}' must have a value for each column in each row, row {uneven[0]} has not.")
-        columns = list(rows[0]) if rows else []
+        if twice := [name for name in columns if columns.count(name) > 1]:
+            raise UserError(f"'{file}' must have each column once, got '{twice[0]}' twice.")
+        if not rows:
+            raise UserError(f"'{file}' must have a row for each frame, it has none.")
         vectors = [self._columns(columns, kind) for kind in ("state", "action")]
         if not {"file", "episode"} <= set(columns) or not all(vectors):
             got = ", ".join(columns) or "none"
@@ -127,16 +131,16 @@ class FolderSource(Source):
         return [name for name in columns if name.startswith(f"{kind}_")]
 
     @cached_property
-    def _episodes(self) -> list[list[dict[str, str]]]:
+    def _episodes(self) -> dict[int, list[dict[str, str]]]:
         by_name: dict[str, list[dict[str, str]]] = {}
         for row in self._rows:
             by_name.setdefault(row["episode"], []).append(row)
-        return list(by_name.values())
+        return dict(zip(_numbers(list(by_name)), by_name.values(), strict=True))
 
     @property
-    def n_episodes(self) -> int:
-        """The number of episodes."""
-        return len(self._episodes)
+    def episodes(self) -> Sequence[int]:
+        """The episodes' numbers: those of their column or, where it holds others than whole numbers, from 0."""
+        return list(self._episodes)
 
     def names(self, key: str) -> list[str] | None:
         """The columns' names without their prefix."""
@@ -163,6 +167,14 @@ class FolderSource(Source):
         if points.ndim != 2 or points.shape[1] < 3:
             raise UserError(f"'{file}' must hold points (N, 3 or more), got shape {points.shape}.")
         return Frame(*self._cropped(points), state, action, row.get("task") or self.task)
+
+
+def _numbers(names: Sequence[str]) -> Sequence[int]:
+    try:
+        numbers = [int(name.removesuffix(".0")) for name in names]
+    except ValueError:
+        return range(len(names))
+    return numbers if len(set(numbers)) == len(numbers) else range(len(names))
 
 
 def _read_ply(file: Path) -> NDArray[Any]:

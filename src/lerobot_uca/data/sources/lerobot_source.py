@@ -1,6 +1,6 @@
 """LeRobot datasets with depth images or clouds."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -51,7 +51,8 @@ class LeRobotSource(Source):
     depth_recipe: CloudRecipe | None = None
 
     @cached_property
-    def _dataset(self) -> Any:
+    def _opened(self) -> tuple[Any, dict[str, Any]]:
+        """The dataset without the pictures that no cloud is made of, and the features of the whole."""
         from lerobot.datasets.lerobot_dataset import LeRobotDataset  # slow to import
 
         with reported(f"'{self.path}' cannot be read"):
@@ -62,17 +63,23 @@ class LeRobotSource(Source):
                 f"'{self.path}' must have {STATE} and {ACTION}; {', '.join(missing)} is missing, got "
                 f"{', '.join(dataset.features)}."
             )
-        return dataset
+        features = dict(dataset.features)
+        _leave_pictures_out(dataset)
+        return dataset, features
+
+    @property
+    def _dataset(self) -> Any:
+        return self._opened[0]
 
     @property
     def features(self) -> dict[str, Any]:
         """The dataset's features, as LeRobot describes them."""
-        return self._dataset.features
+        return self._opened[1]
 
     @property
-    def n_episodes(self) -> int:
-        """The number of episodes."""
-        return self._dataset.num_episodes
+    def episodes(self) -> Sequence[int]:
+        """The episodes' numbers, from 0."""
+        return range(self._dataset.num_episodes)
 
     @property
     def fps(self) -> int:
@@ -102,13 +109,16 @@ class LeRobotSource(Source):
         """Whether there are depth images."""
         return bool(depth_keys(self.features))
 
-    def make_clouds(self, corners: tuple[Any, Any] | None, n_points: int, folder: str | None) -> None:
+    def make_clouds(
+        self, corners: tuple[Any, Any] | None, n_points: int, folder: str | None, episodes: Sequence[int]
+    ) -> None:
         """Make clouds from the depth images from now on.
 
         Args:
             corners: of the crop; None for that of a simulated camera.
             n_points: of a cloud.
             folder: of calibrations. Without one the dataset's own count, and then those of $LEROBOT_UCA_CALIBRATION.
+            episodes: that are looked at, for which the dataset's own must hold.
 
         Raises:
             CalibrationError: if a calibration or the crop is missing.
@@ -118,14 +128,14 @@ class LeRobotSource(Source):
             raise UserError("--colour=true needs points with colours: depth images have none.")
         calibrations = installed_calibrations(folder) or {}
         if not folder:
-            calibrations |= recorded_calibrations(self._dataset)
+            calibrations |= recorded_calibrations(self._dataset, episodes)
         self.depth_recipe = recipe_for(self.features, corners, n_points, calibrations)
 
     def seen(self, episode: int, frame: int) -> str:
         """The part of the scene that the crop covers in one step, in a line."""
         if self.depth_recipe is None:
             return super().seen(episode, frame)
-        item = self._dataset[self._dataset.meta.episodes[episode]["dataset_from_index"] + frame]
+        item = self._item(self._dataset.meta.episodes[episode]["dataset_from_index"] + frame)
         return self._make.seen([item[key].numpy() for key in self.depth_recipe.keys])
 
     def left_out(self) -> list[str]:
@@ -144,8 +154,11 @@ class LeRobotSource(Source):
     def frames(self, episode: int) -> Iterator[Frame]:
         """The steps of one episode."""
         row = self._dataset.meta.episodes[episode]
-        items = (self._dataset[index] for index in range(row["dataset_from_index"], row["dataset_to_index"]))
-        return map(self._frame, items)
+        return map(self._frame, map(self._item, range(row["dataset_from_index"], row["dataset_to_index"])))
+
+    def _item(self, index: int) -> dict[str, Any]:
+        with reported(f"Frame {index} of '{self.path}' cannot be read"):
+            return self._dataset[index]
 
     @cached_property
     def _cloud_key(self) -> str | None:
@@ -191,3 +204,12 @@ class LeRobotSource(Source):
         mask_key = valid_mask(self._cloud_key, item)
         mask = None if mask_key is None else item[mask_key]
         return self._cropped(cloud if mask is None else cloud[mask.numpy().astype(bool)])
+
+
+def _leave_pictures_out(dataset: Any) -> None:
+    """Do not decode what is no depth: it would take most of the time, and may be damaged."""
+    unused = set(dataset.meta.camera_keys) - set(depth_keys(dataset.features))
+    images = sorted(unused & set(dataset.meta.image_keys))
+    for key in unused:
+        del dataset.meta.info.features[key]
+    dataset.reader.hf_dataset = dataset.hf_dataset.remove_columns(images)

@@ -4,7 +4,7 @@ A source is light to send to another process and opens its files there. Letters:
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -45,12 +45,25 @@ class Source(ABC):
 
     @property
     @abstractmethod
-    def n_episodes(self) -> int:
-        """The number of episodes."""
+    def episodes(self) -> Sequence[int]:
+        """The episodes' numbers."""
 
     @abstractmethod
     def frames(self, episode: int) -> Iterator[Frame]:
         """The steps of one episode, each read when it is asked for where the source allows it."""
+
+    def choose(self, episodes: Sequence[int] | None) -> Sequence[int]:
+        """The same episodes; all for None.
+
+        Raises:
+            UserError: if they are not different ones of the source's.
+        """
+        chosen, known = self.episodes if episodes is None else episodes, self.episodes
+        if not chosen or not set(chosen) <= set(known) or len(set(chosen)) < len(chosen):
+            is_row = [*known] == [*range(known[0], known[0] + len(known))] if known else False
+            valid = f"from {known[0]} to {known[-1]}" if is_row else f"of {', '.join(map(str, known)) or 'none'}"
+            raise UserError(f"episodes must be different ones {valid}, got {[*chosen]}.")
+        return chosen
 
     def seen(self, episode: int, frame: int) -> str:
         """The part of the scene that the crop covers in one step, in a line."""

@@ -1,5 +1,6 @@
 """Demonstrators of Adroit's tasks: trained policies, or the episodes of a Minari dataset."""
 
+import logging
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -13,6 +14,8 @@ from lerobot_uca.envs.experts.dapg import DAPGExpert, DAPGWeights
 from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.geometry import Array
+
+logger = logging.getLogger(__name__)
 
 MINARI = "minari:"
 HOW_TO_GET_ONE = (
@@ -36,6 +39,9 @@ def attempts(task: str, source: str | None, first_seed: int) -> Iterator[Attempt
         raise UserError(f"Adroit has no expert built in. Give one with --expert=...: {HOW_TO_GET_ONE}.")
     source = source.replace("{task}", task)
     if source.startswith(MINARI):
+        logger.warning(
+            "The episodes of a Minari dataset start as they were recorded, in their order: --seed is not used."
+        )
         return replays(task, source.removeprefix(MINARI))
     path = Path(source)
     weights = DAPGWeights.read(path)
