@@ -641,7 +641,7 @@ def test_clouds_beside_the_depth_are_not_kept(tmp_path, caplog):
 
 @pytest.mark.parametrize(
     ("root", "message"),
-    [("data/raw", r"would replace the source, '.*data/raw': name another folder"), ("data", "holds other things: raw")],
+    [("data/raw", r"would replace the source, '.*data/raw': name another folder"), ("data", "holds other things, raw")],
 )
 @pytest.mark.usefixtures("calibrated")
 def test_a_source_is_not_replaced(tmp_path, root, message):

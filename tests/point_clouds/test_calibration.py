@@ -59,6 +59,10 @@ WRONG = {
         {"intrinsics": {"width": 640, "height": 480, "fx": 1.88, "fy": 1.88, "cx": 320, "cy": 240}},
         "fx, fy must be pixels that fit 640 x 480, got 1.88, 1.88",
     ),
+    "focal length of zero": (
+        {"intrinsics": {"width": 640, "height": 480, "fx": 600, "fy": 0, "cx": 320, "cy": 240}},
+        "fx, fy must be pixels that fit 640 x 480, got 600, 0",
+    ),
     "centre outside": (
         {"intrinsics": {"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 960, "cy": 240}},
         "cx, cy must lie inside 640 x 480, got 960, 240",

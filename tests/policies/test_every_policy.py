@@ -187,6 +187,7 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
             {"normalization_mapping": {"STATE": NormalizationMode.MIN_MAX}},
             "must name STATE .* and ACTION, got",
         ),
+        ("uca_flow", {"normalization_mapping": {"STATE": "MIN_MAX", "ACTION": "FOO"}}, "MIN_MAX, .* got 'FOO'"),
         ("simple_dp3", {"inference": "compile"}, "'simple_dp3' .* must be one of eager, openvino, "),
         ("flowpolicy", {"delta": 0.0}, "policy.delta must be above 0, got 0.0"),
         ("flowpolicy", {"n_segments": 0}, "policy.n_segments must be at least 1, got 0"),
@@ -196,6 +197,27 @@ def test_a_baseline_learns_the_actions_of_one_batch(name, n_steps):
 def test_wrong_settings(name, changes, message):
     with pytest.raises(UserError, match=message):
         make(name, **changes)
+
+
+@pytest.mark.parametrize("name", NETWORK_CALLS)
+def test_modes_of_normalisation_may_be_texts(name):
+    policy = make(name, normalization_mapping={"STATE": "MEAN_STD", "ACTION": "MIN_MAX"})
+    assert policy.config.normalization_mapping == mapping("MEAN_STD", "MIN_MAX")
+
+
+def test_peft_is_refused():
+    """LeRobot's checkpoint of such a training holds the adapter alone, whose average is what was evaluated."""
+    policy = make("uca_flow")
+    policy.config.pretrained_path = "somewhere"
+    with pytest.raises(UserError, match="--peft trains an adapter alone, which has no averaged weights"):
+        policy._validate_peft_config(None)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.5, 2.0])
+def test_mp1s_loss_is_the_stated_sum(weight):
+    policy = make("mp1", dispersive_weight=weight).train()
+    loss, parts = policy.forward(make_batch(policy.config))
+    assert loss.item() == pytest.approx(parts["loss_u"] + weight * parts["loss_dispersive"], rel=1e-5)
 
 
 @pytest.mark.parametrize("variant", [name for name in VARIANTS if NETWORK_CALLS[VARIANTS[name][0]] == 1])

@@ -133,6 +133,15 @@ def test_only_training_is_augmented():
     assert (preprocess(batch)[OBS_POINT_CLOUD] != batch[OBS_POINT_CLOUD]).any()
 
 
+@pytest.mark.parametrize("options", [{"camera_shift": 0.02}, {"jitter": 0.01}, {"drop": 0.3}])
+@pytest.mark.parametrize("n_frames", [1, 4])
+def test_single_frames_are_no_training_and_stay(options, n_frames):
+    """As of `policy.select_action(preprocess(dataset[0]))`, which holds the action too."""
+    observation = {OBS_POINT_CLOUD: torch.rand(n_frames, 40, 3)}
+    transition = {TransitionKey.OBSERVATION: observation, TransitionKey.ACTION: torch.zeros(n_frames, 4)}
+    assert CloudAugmentationProcessorStep(**options)(transition) is transition
+
+
 def test_off_by_default():
     preprocess, _ = make_processors(make_config(), make_statistics())
     assert CloudAugmentationProcessorStep not in map(type, preprocess.steps)

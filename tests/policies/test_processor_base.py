@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 from tests.builders import N_ACTIONS, N_POINTS, N_STATES, make_config, make_statistics
 
@@ -136,6 +137,29 @@ def test_one_dimension_that_lerobot_reads_as_a_number(leading):
     expected = leading or (1,)
     assert result["observation"][STATE].shape == (*expected, 1)
     assert result["action"].shape == (*expected, 1)
+
+
+@pytest.mark.parametrize("n_actions", [1, 2])
+def test_a_single_window_of_actions_of_one_dimension(n_actions):
+    window = {
+        OBS_POINT_CLOUD: torch.rand(2, N_POINTS, 3),
+        STATE: torch.rand(2, N_STATES),
+    }
+    action = torch.rand(4) if n_actions == 1 else torch.rand(4, n_actions)
+    transition = {"observation": window, "action": action, "complementary_data": {"index": torch.tensor(0)}}
+    assert PointCloudProcessorStep()(transition)["action"].shape == (1, 4, n_actions)
+
+
+@pytest.mark.parametrize("n_points", [None, 12])
+def test_the_features_that_it_gives(n_points):
+    given = {
+        "observation.pointcloud": PolicyFeature(FeatureType.STATE, (N_POINTS, 6)),
+        STATE: PolicyFeature(FeatureType.STATE, (N_STATES,)),
+    }
+    step = PointCloudProcessorStep(n_points=n_points)
+    features = step.transform_features({PipelineFeatureType.OBSERVATION: given, PipelineFeatureType.ACTION: {}})
+    shapes = {name: feature.shape for name, feature in features[PipelineFeatureType.OBSERVATION].items()}
+    assert shapes == {STATE: (N_STATES,), OBS_POINT_CLOUD: (n_points or N_POINTS, 3)}
 
 
 def test_a_state_without_batch_beside_a_cloud_with_one():

@@ -215,3 +215,9 @@ def test_a_folder_that_cannot_be_written(tmp_path, monkeypatch):
     options = ["--camera=front", "--serial=123456", "--intrinsics=[640,480,605,604,321,243]", f"--points={points}"]
     with pytest.raises(UserError, match=r"--folder '.*file' cannot be written"):
         run(monkeypatch, *options, f"--folder={tmp_path / 'file'}")
+
+
+def test_intrinsics_are_looked_at_first(tmp_path):
+    points = write_points(tmp_path / "touched.csv", pixels=True)
+    with pytest.raises(UserError, match=r"^--intrinsics: fx, fy must be pixels that fit 640 x 480, got 605, 0"):
+        calibrate(settings(points=points, intrinsics=(640.0, 480.0, 605.0, 0.0, 321.0, 243.0)))

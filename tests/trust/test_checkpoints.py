@@ -71,6 +71,19 @@ def test_last_is_never_absent(tmp_path, monkeypatch):
     assert (tmp_path / "last").readlink() == Path("2")
 
 
+def test_a_copy_that_followed_links_goes_on(tmp_path, caplog):
+    (tmp_path / "last").mkdir()
+    (tmp_path / "last" / "weights").touch()
+    for step in ("2", "3"):
+        (tmp_path / step).mkdir()
+        update_last_checkpoint(tmp_path / step)
+        assert (tmp_path / "last").readlink() == Path(step)
+    assert (tmp_path / "last.copied-1" / "weights").exists()
+    assert (
+        len([text for text in caplog.messages if "was a folder, not a link to one: it is 'last.copied-1'" in text]) == 1
+    )
+
+
 def test_a_full_disk_leaves_the_checkpoint_before_and_says_how_to_go_on(trained, tmp_path, monkeypatch):
     shutil.copytree(trained.parent / "data", tmp_path / "data")
     save, n_saved = pretrained.save_model_as_safetensor, 0

@@ -3,7 +3,9 @@
 LeRobot writes a checkpoint under its final name, file by file, and removes the link `last` before it makes the new one.
 """
 
+import logging
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ from safetensors import SafetensorError
 
 from lerobot_uca.data.whole_folder import whole_folder
 from lerobot_uca.errors import UserError
+
+logger = logging.getLogger(__name__)
 
 
 def save_whole(save: Callable[..., None]) -> Callable[..., None]:
@@ -39,12 +43,20 @@ def _how_to_resume(checkpoint_dir: Path) -> str:
 
 
 def update_last(_: Callable[[Path], Any]) -> Callable[[Path], None]:
-    """LeRobot's `update_last_checkpoint`, in one step."""
+    """LeRobot's `update_last_checkpoint`, in one step.
+
+    In a copy that followed links `last` is a folder: a checkpoint, which is kept under another name.
+    """
 
     def update_last_checkpoint(checkpoint_dir: Path) -> None:
+        last = checkpoint_dir.with_name(LAST_CHECKPOINT_LINK)
+        if last.is_dir() and not last.is_symlink():
+            names = (last.with_name(f"{last.name}.copied-{number}") for number in count(1))
+            copied = last.rename(next(name for name in names if not name.exists()))
+            logger.warning("'%s' was a folder, not a link to one: it is '%s' now.", last, copied.name)
         new = checkpoint_dir.with_name(f".{LAST_CHECKPOINT_LINK}.new")
         new.unlink(missing_ok=True)
         new.symlink_to(checkpoint_dir.name)
-        new.replace(checkpoint_dir.with_name(LAST_CHECKPOINT_LINK))
+        new.replace(last)
 
     return update_last_checkpoint

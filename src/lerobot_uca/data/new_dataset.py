@@ -34,12 +34,17 @@ def new_dataset_root(repo_id: str, root: Path | None, *, overwrite: bool) -> Pat
 
 
 def _check_dataset(root: Path) -> None:
-    rule = f"--overwrite replaces a dataset and nothing else, and '{root}'"
     if not root.is_dir():
-        raise UserError(f"{rule} is a file. Choose another folder.")
+        raise UserError(f"--overwrite replaces datasets alone: '{root}' is a file. Choose another folder.")
     names = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
     if others := [name for name in names if name not in PARTS]:
         shown = ", ".join(others[:5]) + ", ..." * (len(others) > 5)
-        raise UserError(f"{rule} holds other things: {shown}. Choose another folder, or move them away.")
+        raise UserError(
+            f"--overwrite replaces datasets alone: '{root}' holds other things, {shown}. Choose another folder, or "
+            "move them away."
+        )
     if names and not (root / "meta" / "info.json").is_file():
-        raise UserError(f"{rule} is none: meta/info.json is missing. Choose another folder, or remove it yourself.")
+        raise UserError(
+            f"--overwrite replaces datasets alone: '{root}' is none, meta/info.json is missing. Choose another folder, "
+            "or remove it yourself."
+        )

@@ -169,6 +169,16 @@ def rotation_angle(R: Array) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1)))
 
 
+def check_intrinsics(camera: Camera, source: str) -> None:
+    """Raise a `CalibrationError` for focal lengths or a centre that cannot be a camera's. `source` says whose."""
+    width, height = camera.width, camera.height
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    if not (width > 0 and height > 0 and 0.2 * width < fx < 20 * width and 0.5 * fy < fx < 2 * fy):
+        raise CalibrationError(f"{source}: fx, fy must be pixels that fit {width} x {height}, got {fx:g}, {fy:g}.")
+    if not (0 < cx < width and 0 < cy < height):
+        raise CalibrationError(f"{source}: cx, cy must lie inside {width} x {height}, got {cx:g}, {cy:g}.")
+
+
 def _check(calibration: Calibration, source: str) -> None:
     camera = calibration.camera
     pose, frame = np.array(camera.X_world_camera), calibration.frame
@@ -184,12 +194,7 @@ def _check(calibration: Calibration, source: str) -> None:
             f"{source}: the camera must be within {MAX_DISTANCE} m of the {frame}, got {distance:g} m. Lengths are "
             "metres."
         )
-    width, height = camera.width, camera.height
-    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-    if not (width > 0 and height > 0 and 0.2 * width < fx < 20 * width and 0.5 < fx / fy < 2):
-        raise CalibrationError(f"{source}: fx, fy must be pixels that fit {width} x {height}, got {fx:g}, {fy:g}.")
-    if not (0 < cx < width and 0 < cy < height):
-        raise CalibrationError(f"{source}: cx, cy must lie inside {width} x {height}, got {cx:g}, {cy:g}.")
+    check_intrinsics(camera, source)
     if not 1e-6 < calibration.depth_unit <= 1:
         raise CalibrationError(
             f"{source}: depth_unit must be metres a unit (0.001 for mm), got {calibration.depth_unit:g}."

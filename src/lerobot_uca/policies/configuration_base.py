@@ -131,14 +131,23 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             )
         if self.dtype not in ("float32", "bfloat16"):
             raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
-        kinds = {str(getattr(kind, "value", kind)) for kind in self.normalization_mapping}
-        if not {"STATE", "ACTION"} <= kinds:  # of what is not named LeRobot passes the raw values on
-            raise UserError(
-                "policy.normalization_mapping must name STATE (which the cloud is, too) and ACTION, got "
-                f"{', '.join(sorted(kinds)) or 'nothing'}. IDENTITY leaves one as it is."
-            )
+        self._validate_normalization()
         if self.inference not in BACKENDS:
             raise UserError(f"policy.inference must be one of {', '.join(BACKENDS)}, got '{self.inference}'.")
+
+    def _validate_normalization(self) -> None:
+        mapping = {str(getattr(kind, "value", kind)): mode for kind, mode in self.normalization_mapping.items()}
+        if not {"STATE", "ACTION"} <= mapping.keys():  # of what is not named LeRobot passes the raw values on
+            raise UserError(
+                "policy.normalization_mapping must name STATE (which the cloud is, too) and ACTION, got "
+                f"{', '.join(sorted(mapping)) or 'nothing'}. IDENTITY leaves one as it is."
+            )
+        modes = [mode.value for mode in NormalizationMode]
+        if unknown := [mode for mode in mapping.values() if getattr(mode, "value", mode) not in modes]:
+            raise UserError(f"policy.normalization_mapping must name some of {', '.join(modes)}, got '{unknown[0]}'.")
+        self.normalization_mapping = {
+            kind: NormalizationMode(mode) for kind, mode in mapping.items()
+        }  # in Python texts do
 
     def validate_features(self) -> None:
         """Keep of the dataset's features what the policy uses: a cloud, a state and an action.

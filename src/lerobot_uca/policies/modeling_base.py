@@ -68,6 +68,7 @@ def _without_inference_mode() -> Iterator[None]:
 
 
 ADAPTER = "adapter_model.safetensors"
+NO_PEFT = "which has no averaged weights, and these are evaluated: leave --peft out, these networks are small."
 
 
 class MethodLoss(NamedTuple):
@@ -160,6 +161,10 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
             inputs.check_values(ACTION, x)
             raise self._diverged()
         return (mean if reduction == "mean" else loss.total), dict(zip(loss.parts, values, strict=True))
+
+    def _validate_peft_config(self, _: Any) -> None:
+        """LeRobot calls it before it lets PEFT wrap the policy."""
+        raise UserError(f"--peft trains an adapter alone, {NO_PEFT}")
 
     def _mask(self, batch: Mapping[str, Tensor], x: Tensor) -> Tensor:
         """True (B, T) for the actions that count."""
@@ -290,10 +295,7 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         """
         if not Path(model_file).is_file():
             if Path(model_file).with_name(ADAPTER).is_file():
-                raise UserError(
-                    f"The checkpoint holds a PEFT adapter alone ('{ADAPTER}'): merge it into its policy and save that, "
-                    "PeftModel.merge_and_unload() and save_pretrained()."
-                )
+                raise UserError(f"The checkpoint holds a PEFT adapter alone ('{ADAPTER}'), {NO_PEFT}")
             raise UserError(f"The checkpoint has no weights: '{model_file}' does not exist.")
         try:
             loaded = super()._load_as_safetensor(model, model_file, map_location, strict=True)

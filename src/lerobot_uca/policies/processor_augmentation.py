@@ -15,7 +15,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.distributed import independent_draws
-from lerobot_uca.policies.processor_step import SameFeaturesStep
+from lerobot_uca.policies.processor_step import SameFeaturesStep, training_clouds
 
 
 def augmentation_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
@@ -43,9 +43,8 @@ def augmentation_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
 class CloudAugmentationProcessorStep(SameFeaturesStep):
     """Moves clouds rigidly, shakes their points and leaves some out, in training only.
 
-    A batch belongs to training if it holds actions and gradients are computed; an evaluation's, a robot's and a
-    validation's stay as they are. The clouds (B, O, N, 3) are in the robot's base frame [m]: the step stands before
-    the normaliser. Draws come from PyTorch's generator, which `seed` sets and a checkpoint restores.
+    The clouds (B, O, N, 3) are in the robot's base frame [m]: the step stands before the normaliser. Draws come from
+    PyTorch's generator, which `seed` sets and a checkpoint restores.
 
     Args:
         jitter, drop, camera_shift, camera_turn: see `AugmentationConfig`.
@@ -60,14 +59,13 @@ class CloudAugmentationProcessorStep(SameFeaturesStep):
 
     @override
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        observation = transition.get(TransitionKey.OBSERVATION) or {}
-        is_training = transition.get(TransitionKey.ACTION) is not None and torch.is_grad_enabled()
-        if not is_training or OBS_POINT_CLOUD not in observation:
+        cloud = training_clouds(transition)
+        if cloud is None:
             return transition
-        cloud = observation[OBS_POINT_CLOUD]
         with independent_draws(cloud.device):
             changed = self.augmented(cloud)
-        return {**transition, TransitionKey.OBSERVATION: {**observation, OBS_POINT_CLOUD: changed}}
+        observation = {**transition[TransitionKey.OBSERVATION], OBS_POINT_CLOUD: changed}
+        return {**transition, TransitionKey.OBSERVATION: observation}
 
     def augmented(self, cloud: Tensor) -> Tensor:
         """Changed clouds of (B, O, N, 3), or more channels, of which the first three are xyz [m, base frame]."""

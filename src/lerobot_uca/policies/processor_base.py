@@ -194,13 +194,16 @@ class PointCloudProcessorStep(ProcessorStep):
         mask = None if mask_key is None else torch.as_tensor(observation.pop(mask_key))
         observation[OBS_POINT_CLOUD] = self.uniform(cloud, mask)
         transition = transition.copy()
+        transition[TransitionKey.OBSERVATION] = observation
+        is_single = _is_single(transition)
         if OBS_STATE in observation:
             observation[OBS_STATE] = _with_last_dimension(_as_float(observation[OBS_STATE]), cloud)
         action = transition.get(TransitionKey.ACTION)
         if action is not None:
-            transition[TransitionKey.ACTION] = _with_last_dimension(_as_float(action), cloud)
-        transition[TransitionKey.OBSERVATION] = observation
-        return _with_batch(transition) if _is_single(transition) else transition
+            action = _as_float(action)
+            is_numbers = is_single and action.ndim == cloud.ndim - 2  # of a window T, where the cloud has O
+            transition[TransitionKey.ACTION] = action[..., None] if is_numbers else _with_last_dimension(action, cloud)
+        return _with_batch(transition) if is_single else transition
 
     def uniform(self, cloud: Tensor, mask: Tensor | None = None) -> Tensor:
         """Valid points, (..., N, 3) or of more points (..., n_points, 3), with colour 6, of clouds (..., N, C).
@@ -234,7 +237,8 @@ class PointCloudProcessorStep(ProcessorStep):
         observations = dict(features[PipelineFeatureType.OBSERVATION])
         key = find_point_cloud(observations)
         if key is not None:
-            n_points = self.n_points or observations.pop(key).shape[0]
+            n_given = observations.pop(key).shape[0]
+            n_points = n_given if self.n_points is None else self.n_points
             observations[OBS_POINT_CLOUD] = PolicyFeature(FeatureType.STATE, (n_points, self._n_channels))
         return {**features, PipelineFeatureType.OBSERVATION: observations}
 
@@ -246,7 +250,7 @@ def _as_float(values: Any) -> Tensor:
 def _with_last_dimension(values: Tensor, cloud: Tensor) -> Tensor:
     """A vector of one dimension, which LeRobot reads as a number, as a vector again.
 
-    To a cloud (..., N, C) belong vectors (..., D), so here numbers (...); an action has T where the cloud has O.
+    To a cloud (..., N, C) belong vectors (..., D), so here numbers (...); a batch's actions have T where it has O.
     """
     is_number = values.ndim == cloud.ndim - 2 and values.shape[:1] == cloud.shape[: min(values.ndim, 1)]
     return values.unsqueeze(-1) if is_number else values

@@ -15,7 +15,7 @@ from torch import Tensor
 from lerobot_uca.features import OBS_POINT_CLOUD
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.distributed import independent_draws
-from lerobot_uca.policies.processor_step import SameFeaturesStep
+from lerobot_uca.policies.processor_step import SameFeaturesStep, training_clouds
 
 
 def scene_turn_steps(config: PointCloudPolicyConfig) -> list[ProcessorStep]:
@@ -51,14 +51,10 @@ class SceneTurnProcessorStep(SameFeaturesStep):
 
     @override
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        observation = transition.get(TransitionKey.OBSERVATION) or {}
-        action = transition.get(TransitionKey.ACTION)
-        is_training = action is not None and torch.is_grad_enabled()
-        if not is_training or OBS_POINT_CLOUD not in observation or OBS_STATE not in observation:
+        cloud = training_clouds(transition)
+        if cloud is None or OBS_STATE not in transition[TransitionKey.OBSERVATION]:
             return transition
-        cloud = observation[OBS_POINT_CLOUD]
-        if cloud.ndim != 4:  # a single frame, whose batch comes later, is not training's
-            return transition
+        observation, action = transition[TransitionKey.OBSERVATION], transition[TransitionKey.ACTION]
         with independent_draws(cloud.device):
             angle = torch.deg2rad(self.degrees * cloud.new_empty(len(cloud)).uniform_(-1, 1))
         cloud, state, action = self.turned(cloud, observation[OBS_STATE], action, angle)

@@ -17,7 +17,13 @@ from lerobot.configs import parser
 from tqdm import tqdm
 
 from lerobot_uca.errors import UserError
-from lerobot_uca.point_clouds.calibration import Calibration, CalibrationError, pose_difference, read_calibrations
+from lerobot_uca.point_clouds.calibration import (
+    Calibration,
+    CalibrationError,
+    check_intrinsics,
+    pose_difference,
+    read_calibrations,
+)
 from lerobot_uca.point_clouds.depth import MILLIMETRE
 from lerobot_uca.point_clouds.geometry import Array, Camera, as_pose
 from lerobot_uca.point_clouds.registration import Fit, fit_board, fit_points
@@ -96,6 +102,7 @@ def calibrate(config: CalibrateConfig) -> tuple[Calibration, Fit]:
     width, height, fx, fy, cx, cy = config.intrinsics
     camera = Camera(config.camera, fx, fy, cx, cy, int(width), int(height), as_pose(np.eye(4)))
     try:
+        check_intrinsics(camera, "--intrinsics")
         if config.points is not None:
             if config.on_arm:
                 raise UserError("Touched points calibrate a fixed camera; for one on the arm use --board_folder.")
