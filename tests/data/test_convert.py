@@ -79,9 +79,7 @@ def test_the_new_dataset_knows_how_it_was_made_and_reads_fast(depth_dataset, tmp
     assert (dataset.num_episodes, dataset.num_frames) == (1, 6)
     info = dataset.features[OBS_POINT_CLOUD]["info"]
     assert CloudRecipe.from_dict(info[RECIPE_INFO]) == make_recipe()
-    origin = json.loads((dataset.root / "meta" / "conversion.json").read_text())
-    assert (origin["source"], origin["episodes"], origin["n_points"]) == ("data", [1], N_CLOUD_POINTS)
-    assert origin["crop_low"] == list(CROP.low)
+    assert info["crop"] == [list(CROP.low), list(CROP.high)]
     assert BatchedDataset("test/clouds", root=dataset.root).is_batched
 
 
@@ -175,7 +173,7 @@ def test_without_a_crop_all_points_count(tmp_path):
     write_zarr(tmp_path / "a.zarr", channels=3)
     dataset = convert(config(tmp_path / "a.zarr", tmp_path / "clouds", fps=10, crop_low=None, crop_high=None))
     assert dataset.meta.stats[OBS_POINT_CLOUD]["min"].min() < -0.05
-    assert json.loads((dataset.root / "meta" / "conversion.json").read_text())["crop_low"] is None
+    assert dataset.features[OBS_POINT_CLOUD]["info"]["crop"] is None
 
 
 @pytest.mark.parametrize("colours", [0, 3])
@@ -254,7 +252,7 @@ def test_a_calibration_beside_the_depth_must_be_right(tmp_path, monkeypatch):
 
     wrong = {
         "Camera 'front' moves by 40.0 mm and 0.00 deg in the dataset, first in episode 0 ": {"pose_of": moving},
-        "observation.intrinsics.front' must be the same in all frames": {"focal_of": lambda index: 57 + index},
+        "must be the same in all frames, it changes by 2, first in episode 0: ": {"focal_of": lambda index: 57 + index},
         "pose must hold a rotation": {"pose_of": lambda _: np.diag([2.0, 1, 1, 1])},
     }
     for number, (message, each) in enumerate(wrong.items()):
@@ -334,7 +332,7 @@ def test_a_damaged_video_is_one_line(tmp_path):
     source = write_depth_dataset(tmp_path / "data", video=True, n_episodes=1)
     (video,) = source.root.rglob("*.mp4")
     video.write_bytes(video.read_bytes()[:300])
-    with pytest.raises(UserError, match=r"^Frame 0 of '.*data' cannot be read: \w+: ") as error:
+    with pytest.raises(UserError, match=r"^Frame 0 of episode 0 of '.*data' cannot be read: \w+: ") as error:
         convert(config(source.root, tmp_path / "clouds"))
     assert "\n" not in str(error.value)
 
@@ -360,7 +358,7 @@ def test_pictures_that_no_cloud_is_made_of_are_not_decoded(tmp_path, kind, caplo
         video.write_bytes(b"damaged")
     found = find_source(tmp_path / "data", CROP, "")
     found.make_clouds((CROP.low, CROP.high), N_CLOUD_POINTS, None, [0])
-    assert "observation.images.rgb" not in found._item(0)
+    assert "observation.images.rgb" not in next(found._items(0))
     dataset = convert(config(tmp_path / "data", tmp_path / "clouds"))
     np.testing.assert_array_equal(dataset[2][OBS_POINT_CLOUD].numpy(), make_recipe().make()([live_frame(2)]))
     assert "Not kept: observation.images.rgb." in caplog.messages
@@ -380,7 +378,7 @@ def test_a_folders_episodes_are_chosen_by_their_numbers(tmp_path, names, chosen,
 
 def test_episodes_that_there_are_not(tmp_path):
     write_folder(tmp_path / "recorded", "npz")
-    for number, (names, valid) in enumerate({"34": "from 3 to 4", "25": "of 2, 5", "ab": "from 0 to 1"}.items()):
+    for number, (names, valid) in enumerate({"34": "from 3 to 4", "25": "among 2, 5", "ab": "from 0 to 1"}.items()):
         rows = [f"{index}.npz,{names[index // 2]},0,0" for index in range(4)]
         (tmp_path / "recorded" / "frames.csv").write_text("\n".join(["file,episode,state_x,action_x", *rows]) + "\n")
         with pytest.raises(UserError, match=rf"^episodes must be different ones {valid}, got \[7\]"):
@@ -389,7 +387,14 @@ def test_episodes_that_there_are_not(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("file,episode,state_x,state_x,action_x\n0.npz,0,1,2,3\n", "got 'state_x' twice"), ("", "it has none")],
+    [
+        ("file,episode,state_x,state_x,action_x\n0.npz,0,1,2,3\n", "got 'state_x' twice"),
+        (
+            "file,episode,state_x,action_x\n0.npz,1,2,3\n1.npz,01,2,3\n",
+            "must have one name for each episode, got 1 and 01",
+        ),
+        ("", "it has none"),
+    ],
 )
 def test_a_frames_csv_that_would_lose_something(tmp_path, content, message):
     write_folder(tmp_path / "recorded", "npz")
@@ -403,11 +408,18 @@ def test_two_conversions_can_be_merged(depth_dataset, tmp_path, monkeypatch):
     roots = [tmp_path / "monday", tmp_path / "tuesday"]
     for root, episodes in zip(roots, ([0], [1]), strict=True):
         convert(config(depth_dataset.root, root, episodes=episodes))
-    paths = json.dumps([str(root) for root in roots])
-    options = ('--operation.repo_ids=["test/a", "test/b"]', f"--operation.roots={paths}", "--new_repo_id=test/both")
-    command = ["lerobot-uca-edit-dataset", "--repo_id=test/a", "--operation.type=merge", *options]
-    monkeypatch.setattr(sys, "argv", [*command, f"--new_root={tmp_path / 'both'}"])
-    edit_dataset.run()
+    convert(config(depth_dataset.root, tmp_path / "lower", crop_low=(CROP.low[0], CROP.low[1], CROP.low[2] - 0.01)))
+
+    def merge(*roots):
+        paths = json.dumps([str(root) for root in roots])
+        options = ('--operation.repo_ids=["test/a", "test/b"]', f"--operation.roots={paths}", "--new_repo_id=test/both")
+        command = ["lerobot-uca-edit-dataset", "--repo_id=test/a", "--operation.type=merge", *options]
+        monkeypatch.setattr(sys, "argv", [*command, f"--new_root={tmp_path / 'both'}"])
+        edit_dataset.run()
+
+    with pytest.raises(UserError, match="Same features is expected"):
+        merge(roots[0], tmp_path / "lower")
+    merge(*roots)
     assert LeRobotDataset("test/both", root=tmp_path / "both").num_episodes == 2
 
 

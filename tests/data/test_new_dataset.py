@@ -20,9 +20,15 @@ def test_nothing_else_is(tmp_path):
     """A folder of datasets or of trainings, one step too high."""
     (tmp_path / "file").touch()
     (tmp_path / "folder" / "data").mkdir(parents=True)
+    (tmp_path / "hidden" / ".git").mkdir(parents=True)
     write_dataset(tmp_path / "mixed", n_episodes=1)
     (tmp_path / "mixed" / "training").mkdir()
-    reasons = {"file": "is a file", "folder": "is none, meta/info.json", "mixed": "holds other things, training"}
+    reasons = {
+        "file": "is a file",
+        "folder": "is none, meta/info.json",
+        "hidden": "is none, meta/info.json",
+        "mixed": "holds other things, training",
+    }
     for name, reason in reasons.items():
         with pytest.raises(UserError, match=f"^--overwrite replaces datasets alone: '.*/{name}' {reason}"):
             new_dataset_root("a/b", tmp_path / name, overwrite=True)

@@ -206,11 +206,11 @@ def test_modes_of_normalisation_may_be_texts(name):
 
 
 def test_peft_is_refused():
-    """LeRobot's checkpoint of such a training holds the adapter alone, whose average is what was evaluated."""
-    policy = make("uca_flow")
-    policy.config.pretrained_path = "somewhere"
-    with pytest.raises(UserError, match="--peft trains an adapter alone, which has no averaged weights"):
-        policy._validate_peft_config(None)
+    """LeRobot's checkpoint of such a training holds the adapter alone, and not the average, which was evaluated."""
+    with pytest.raises(UserError, match="PEFT trains an adapter alone, which has no averaged weights"):
+        make("uca_flow").wrap_with_peft(peft_cli_overrides={"method_type": "LORA"})
+    with pytest.raises(UserError, match="PEFT trains an adapter alone, which has no averaged weights"):
+        make("uca_flow", use_peft=True)  # as such a checkpoint's configuration says
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5, 2.0])

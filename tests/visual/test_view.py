@@ -54,6 +54,17 @@ def test_colours_are_the_points_own_where_they_have_some():
     np.testing.assert_array_equal(colours_of(points[:, :3], CROP), [INSIDE, OUTSIDE])
 
 
+def test_an_episode_of_a_folder_by_its_number_and_by_default_the_first(tmp_path):
+    for index in range(4):
+        np.savez(tmp_path / f"{index}.npz", points=np.full((5, 3), index / 10, np.float32))
+    rows = ["file,episode,state_x,action_x", *(f"{index}.npz,{1 + index // 2},0,0" for index in range(4))]
+    (tmp_path / "frames.csv").write_text("\n".join(rows) + "\n")
+    for episode, first in ((None, 0.0), (1, 0.0), (2, 0.2)):
+        assert next(clouds_of(ViewConfig(source=tmp_path, episode=episode)))[0, 0] == np.float32(first)
+    with pytest.raises(UserError, match=r"^episode must be from 1 to 2, got 0\."):
+        next(clouds_of(ViewConfig(source=tmp_path, episode=0)))
+
+
 def test_one_task_of_a_group_has_to_be_named():
     with pytest.raises(UserError, match=r"One task can be viewed, got reach,push: reach, push\."):
         next(clouds_of(ViewConfig(env=MetaworldPointCloudConfig(task="reach,push", n_points=64))))

@@ -26,7 +26,7 @@ class EpisodeReport(NamedTuple):
 
 
 def require_pictures() -> Any:
-    """The figures of matplotlib, or a `UserError`."""
+    """The figures of matplotlib, or a `UserError`: asked for before the work, at whose end the report stands."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -37,12 +37,11 @@ def require_pictures() -> Any:
 
 
 def prepare_report(folder: Path, root: Path) -> None:
-    """Make the folder of a report on the dataset that is to be written in `root`, at whose end the report stands.
+    """Make the folder of a report on the dataset that is to be written in `root`.
 
     Raises:
-        UserError: if it cannot be made, would be replaced with the dataset, or pictures cannot be drawn.
+        UserError: if it cannot be made, or would be replaced with the dataset.
     """
-    require_pictures()
     if folder.resolve().is_relative_to(root.resolve()):
         raise UserError(f"--report must lie outside the new dataset '{root}', got '{folder}'.")
     try:

@@ -215,5 +215,5 @@ def run(config: CollectConfig) -> None:
     dataset = collect(config)
     print(
         f"{dataset.num_episodes} episodes, {dataset.num_frames} frames: {dataset.root}\n"
-        f"Evaluate on other seeds than --seed={config.seed} and up (lerobot-eval uses 1000 and up)."
+        f"Evaluate on other seeds than these (lerobot-eval uses 1000 and up)."
     )

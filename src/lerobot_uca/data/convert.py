@@ -4,14 +4,12 @@ Example:
     lerobot-uca-convert --source=data/depth --repo_id=me/clouds --crop_low='[0.2,-0.3,0.01]' --crop_high='[0.8,0.3,0.4]'
 """
 
-import json
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +23,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_uca.bounds import check_bounds, within
-from lerobot_uca.data.cloud_report import EpisodeReport, prepare_report, write_report
+from lerobot_uca.data.cloud_report import EpisodeReport, prepare_report, require_pictures, write_report
 from lerobot_uca.data.new_dataset import new_dataset_root
 from lerobot_uca.data.sources.find import find_source
 from lerobot_uca.data.sources.lerobot_source import LeRobotSource
@@ -107,7 +105,7 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
     check_bounds(config)
     root = new_dataset_root(config.repo_id, config.root, overwrite=config.overwrite)
     if config.report is not None:
-        prepare_report(config.report, root)
+        require_pictures()
     source, episodes = make_source(config)
     if isinstance(source, LeRobotSource) and (config.fps is not None or config.task):
         logger.warning("--fps and --task are for sources without them; a LeRobot dataset keeps its own.")
@@ -116,6 +114,8 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
         raise UserError(f"'{config.source}' does not say how many steps a second it has: give --fps.")
     if config.source.resolve().is_relative_to(root.resolve()):
         raise UserError(f"--root '{root}' would replace the source, '{config.source}': name another folder.")
+    if config.report is not None:
+        prepare_report(config.report, root)
     with whole_folder(root, overwrite=config.overwrite) as unfinished:
         _write(config, source, fps, episodes, unfinished)
     if left_out := source.left_out():
@@ -206,20 +206,6 @@ def _write(config: ConvertConfig, source: Source, fps: int, episodes: Sequence[i
             f"points inside the crop, the first is frame {few[0]} with {first_bad.n_points[few[0]]}. {first_bad.seen}. "
             "Move the crop, or leave the episode out with --episodes; --report=FOLDER shows all."
         )
-    _write_origin(root / "meta" / "conversion.json", config, source, episodes)
-
-
-def _write_origin(file: Path, config: ConvertConfig, source: Source, episodes: Sequence[int]) -> None:
-    """Where the clouds come from. Among the features it would keep LeRobot from merging two conversions."""
-    origin = {
-        "source": source.path.resolve().name,
-        "episodes": [*episodes],
-        "crop_low": config.crop_low,
-        "crop_high": config.crop_high,
-        "n_points": config.n_points,
-        "version": version("lerobot_policy_uca_flow"),
-    }
-    file.write_text(json.dumps(origin, indent=2) + "\n", encoding="utf-8")
 
 
 def _warn_of_nan(reports: list[EpisodeReport]) -> None:
@@ -258,8 +244,12 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> None:
 
 
 def _features(config: ConvertConfig, source: Source, episode: Episode) -> dict[str, dict[str, Any]]:
-    recipe = source.recipe
-    info: dict[str, Any] = {**observation_info(source.observation)}
+    recipe, crop = source.recipe, source.crop
+    # LeRobot merges datasets whose features are equal: those of one crop, whatever their sources.
+    info: dict[str, Any] = {
+        "crop": [list(crop.low), list(crop.high)] if crop else None,
+        **observation_info(source.observation),
+    }
     if recipe is not None:
         info[RECIPE_INFO] = replace(recipe, n_points=config.n_points).as_dict()
     return {

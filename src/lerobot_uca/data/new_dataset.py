@@ -36,8 +36,8 @@ def new_dataset_root(repo_id: str, root: Path | None, *, overwrite: bool) -> Pat
 def _check_dataset(root: Path) -> None:
     if not root.is_dir():
         raise UserError(f"--overwrite replaces datasets alone: '{root}' is a file. Choose another folder.")
-    names = sorted(path.name for path in root.iterdir() if not path.name.startswith("."))
-    if others := [name for name in names if name not in PARTS]:
+    names = sorted(path.name for path in root.iterdir())
+    if others := [name for name in names if name not in PARTS and not name.startswith(".")]:
         shown = ", ".join(others[:5]) + ", ..." * (len(others) > 5)
         raise UserError(
             f"--overwrite replaces datasets alone: '{root}' holds other things, {shown}. Choose another folder, or "

@@ -66,13 +66,16 @@ def _calibration(dataset: Any, name: str, shape: tuple[int, ...], episodes: Sequ
     columns = dataset.hf_dataset.select_columns(wanted).with_format("numpy")[:]
     is_chosen = np.isin(columns["episode_index"], columns["episode_index"] if episodes is None else episodes)
     K, X = (np.asarray(columns[kind + name], dtype=np.float64)[is_chosen] for kind in (INTRINSICS, EXTRINSICS))
-    if np.ptp(K, axis=0).max() > 1e-3:
+    episode_of = columns["episode_index"][is_chosen]
+    changes = np.abs(K - K[0]).max(axis=(1, 2))
+    if (is_off := changes > 1e-3).any():
         raise UserError(
-            f"'{INTRINSICS}{name}' must be the same in all frames, it changes by {np.ptp(K, axis=0).max()}."
+            f"'{INTRINSICS}{name}' must be the same in all frames, it changes by {changes.max():g}, first in episode "
+            f"{episode_of[is_off.argmax()]}: choose episodes in which it stays."
         )
     moved = np.array([pose_difference(X[0], each) for each in X])
     if (is_off := (moved > STILL).any(axis=1)).any():
-        (mm, deg), episode = moved.max(axis=0), columns["episode_index"][is_chosen][is_off.argmax()]
+        (mm, deg), episode = moved.max(axis=0), episode_of[is_off.argmax()]
         raise UserError(
             f"Camera '{name}' moves by {mm:.1f} mm and {deg:.2f} deg in the dataset, first in episode {episode} "
             f"('{EXTRINSICS}{name}'). Clouds need a fixed camera: choose episodes in which it stands still."

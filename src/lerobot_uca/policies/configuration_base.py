@@ -20,6 +20,11 @@ from lerobot_uca.policies.optimizer import FusedAdamWConfig
 
 logger = logging.getLogger(__name__)
 
+NO_PEFT = (
+    "PEFT trains an adapter alone, which has no averaged weights, and these are what is evaluated: train the whole "
+    "network, which is small, without --peft."
+)
+
 
 @dataclass
 class PointCloudPolicyConfig(PreTrainedConfig):
@@ -131,6 +136,8 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             )
         if self.dtype not in ("float32", "bfloat16"):
             raise UserError(f"policy.dtype must be float32 or bfloat16, got '{self.dtype}'.")
+        if self.use_peft:
+            raise UserError(NO_PEFT)
         self._validate_normalization()
         if self.inference not in BACKENDS:
             raise UserError(f"policy.inference must be one of {', '.join(BACKENDS)}, got '{self.inference}'.")

@@ -31,7 +31,7 @@ from lerobot_uca.policies import (
     inputs,
     processor_base,  # noqa: F401 (registers the steps that checkpoints name)
 )
-from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
+from lerobot_uca.policies.configuration_base import NO_PEFT, PointCloudPolicyConfig
 from lerobot_uca.policies.distributed import independent_draws
 from lerobot_uca.policies.history import Frame, ObservationHistory
 from lerobot_uca.policies.publishing import PublishedPolicy
@@ -68,7 +68,6 @@ def _without_inference_mode() -> Iterator[None]:
 
 
 ADAPTER = "adapter_model.safetensors"
-NO_PEFT = "which has no averaged weights, and these are evaluated: leave --peft out, these networks are small."
 
 
 class MethodLoss(NamedTuple):
@@ -162,9 +161,9 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
             raise self._diverged()
         return (mean if reduction == "mean" else loss.total), dict(zip(loss.parts, values, strict=True))
 
-    def _validate_peft_config(self, _: Any) -> None:
-        """LeRobot calls it before it lets PEFT wrap the policy."""
-        raise UserError(f"--peft trains an adapter alone, {NO_PEFT}")
+    def wrap_with_peft(self, peft_config: Any = None, peft_cli_overrides: dict[str, Any] | None = None) -> Any:  # noqa: ARG002
+        """LeRobot's `--peft`: refused."""
+        raise UserError(NO_PEFT)
 
     def _mask(self, batch: Mapping[str, Tensor], x: Tensor) -> Tensor:
         """True (B, T) for the actions that count."""
@@ -295,7 +294,7 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         """
         if not Path(model_file).is_file():
             if Path(model_file).with_name(ADAPTER).is_file():
-                raise UserError(f"The checkpoint holds a PEFT adapter alone ('{ADAPTER}'), {NO_PEFT}")
+                raise UserError(f"The checkpoint holds a PEFT adapter alone ('{ADAPTER}'). {NO_PEFT}")
             raise UserError(f"The checkpoint has no weights: '{model_file}' does not exist.")
         try:
             loaded = super()._load_as_safetensor(model, model_file, map_location, strict=True)

@@ -161,8 +161,8 @@ class PointCloudProcessorStep(ProcessorStep):
     - A cloud of more than n_points is sampled farthest point by farthest point. One that is in this order already (as
       those of this package's environments are) keeps its first n_points.
     - Everything becomes float32: LeRobot's normaliser takes on its input's type, statistics included.
-    - A single frame gets a batch dimension, and a state or action of one dimension, which LeRobot reads as numbers,
-      its last one.
+    - A single frame or window gets a batch dimension, and a state or action of one dimension, which LeRobot reads as
+      numbers, its last one: the action (T,) of a single window is T numbers.
 
     Args:
         n_points: points of a cloud that the policy looks at; None for all.
@@ -201,7 +201,7 @@ class PointCloudProcessorStep(ProcessorStep):
         action = transition.get(TransitionKey.ACTION)
         if action is not None:
             action = _as_float(action)
-            is_numbers = is_single and action.ndim == cloud.ndim - 2  # of a window T, where the cloud has O
+            is_numbers = is_single and action.ndim == cloud.ndim - 2  # a window's actions of one dimension, (T,)
             transition[TransitionKey.ACTION] = action[..., None] if is_numbers else _with_last_dimension(action, cloud)
         return _with_batch(transition) if is_single else transition
 

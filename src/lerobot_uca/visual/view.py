@@ -58,8 +58,8 @@ class ViewConfig:
     camera: CameraConfig | None = None
     # The name by which the camera is calibrated.
     camera_name: str = "front"
-    # Episode of a source, or seed of an environment.
-    episode: int = within(0, least=0)
+    # Episode of a source, by default its first, or seed of an environment, by default 0.
+    episode: int | None = within(None, least=0)
     # Lowest corner of the crop [m]; points outside are grey.
     crop_low: tuple[float, float, float] | None = None
     # Highest corner of the crop [m].
@@ -91,12 +91,14 @@ def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
     if config.camera is not None:
         yield from live_clouds(config.camera, config.camera_name, config.calibration, WIDE, MAX_POINTS)
     if config.env is not None:
-        yield _first_cloud(config.env, config.episode)
+        yield _first_cloud(config.env, config.episode or 0)
         return
     assert config.source is not None
     try:
         source = find_source(config.source, None, "", colour=config.colour)
-        (episode,) = source.choose([config.episode])
+        episode = source.choose(None)[0] if config.episode is None else config.episode
+        if episode not in source.episodes:
+            raise UserError(f"episode must be {source.valid}, got {episode}.")
         if isinstance(source, LeRobotSource) and source.has_depth:
             source.make_clouds((WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration, [episode])
     except CalibrationError as error:

@@ -135,7 +135,18 @@ class FolderSource(Source):
         by_name: dict[str, list[dict[str, str]]] = {}
         for row in self._rows:
             by_name.setdefault(row["episode"], []).append(row)
-        return dict(zip(_numbers(list(by_name)), by_name.values(), strict=True))
+        return dict(zip(self._numbers(list(by_name)), by_name.values(), strict=True))
+
+    def _numbers(self, names: Sequence[str]) -> Sequence[int]:
+        whole = [name.removesuffix(".0") for name in names]
+        if not all(name.isdecimal() for name in whole):
+            return range(len(names))
+        numbers = [int(name) for name in whole]
+        if twice := [name for name, number in zip(names, numbers, strict=True) if numbers.count(number) > 1]:
+            raise UserError(
+                f"'{self.path / 'frames.csv'}' must have one name for each episode, got {' and '.join(twice)}."
+            )
+        return numbers
 
     @property
     def episodes(self) -> Sequence[int]:
@@ -167,14 +178,6 @@ class FolderSource(Source):
         if points.ndim != 2 or points.shape[1] < 3:
             raise UserError(f"'{file}' must hold points (N, 3 or more), got shape {points.shape}.")
         return Frame(*self._cropped(points), state, action, row.get("task") or self.task)
-
-
-def _numbers(names: Sequence[str]) -> Sequence[int]:
-    try:
-        numbers = [int(name.removesuffix(".0")) for name in names]
-    except ValueError:
-        return range(len(names))
-    return numbers if len(set(numbers)) == len(numbers) else range(len(names))
 
 
 def _read_ply(file: Path) -> NDArray[Any]:

@@ -135,7 +135,7 @@ class LeRobotSource(Source):
         """The part of the scene that the crop covers in one step, in a line."""
         if self.depth_recipe is None:
             return super().seen(episode, frame)
-        item = self._item(self._dataset.meta.episodes[episode]["dataset_from_index"] + frame)
+        item = next(self._items(episode, frame))
         return self._make.seen([item[key].numpy() for key in self.depth_recipe.keys])
 
     def left_out(self) -> list[str]:
@@ -153,12 +153,15 @@ class LeRobotSource(Source):
 
     def frames(self, episode: int) -> Iterator[Frame]:
         """The steps of one episode."""
-        row = self._dataset.meta.episodes[episode]
-        return map(self._frame, map(self._item, range(row["dataset_from_index"], row["dataset_to_index"])))
+        return map(self._frame, self._items(episode))
 
-    def _item(self, index: int) -> dict[str, Any]:
-        with reported(f"Frame {index} of '{self.path}' cannot be read"):
-            return self._dataset[index]
+    def _items(self, episode: int, first: int = 0) -> Iterator[dict[str, Any]]:
+        """The steps of one episode as LeRobot gives them, from one on."""
+        row = self._dataset.meta.episodes[episode]
+        for frame in range(first, row["dataset_to_index"] - row["dataset_from_index"]):
+            with reported(f"Frame {frame} of episode {episode} of '{self.path}' cannot be read"):
+                item = self._dataset[row["dataset_from_index"] + frame]
+            yield item
 
     @cached_property
     def _cloud_key(self) -> str | None:

@@ -58,12 +58,18 @@ class Source(ABC):
         Raises:
             UserError: if they are not different ones of the source's.
         """
-        chosen, known = self.episodes if episodes is None else episodes, self.episodes
-        if not chosen or not set(chosen) <= set(known) or len(set(chosen)) < len(chosen):
-            is_row = [*known] == [*range(known[0], known[0] + len(known))] if known else False
-            valid = f"from {known[0]} to {known[-1]}" if is_row else f"of {', '.join(map(str, known)) or 'none'}"
-            raise UserError(f"episodes must be different ones {valid}, got {[*chosen]}.")
+        chosen = self.episodes if episodes is None else episodes
+        if not chosen or not set(chosen) <= set(self.episodes) or len(set(chosen)) < len(chosen):
+            raise UserError(f"episodes must be different ones {self.valid}, got {[*chosen]}.")
         return chosen
+
+    @property
+    def valid(self) -> str:
+        """The episodes' numbers in words."""
+        numbers = [*self.episodes]
+        if numbers and numbers == [*range(numbers[0], numbers[0] + len(numbers))]:
+            return f"from {numbers[0]} to {numbers[-1]}"
+        return f"among {', '.join(map(str, numbers)) or 'none'}"
 
     def seen(self, episode: int, frame: int) -> str:
         """The part of the scene that the crop covers in one step, in a line."""

@@ -52,6 +52,20 @@ def step_towards(q: Array, qd: Array, target: Array, limits: JointLimits, dt: fl
     return q + qd * dt, qd
 
 
+FOLLOWS_WITHIN = 0.1
+"""[rad] An arm that follows is no farther behind its setpoint, besides what either's motion explains."""
+
+
+def is_followed(setpoint: Array, velocity: Array, q: Array, qd: Array, delay: float) -> bool:
+    """Whether an arm at q with qd follows a setpoint that moves with a velocity, all (6,).
+
+    By servoj's nature a moving arm is behind by its velocity times a delay [s]; also of a setpoint that stands ahead of
+    it after a gap.
+    """
+    fastest = max(np.abs(velocity).max(), np.abs(qd).max())
+    return bool(np.abs(setpoint - q).max() <= FOLLOWS_WITHIN + fastest * delay)
+
+
 class Interpolator:
     """Makes a smooth path of targets that come seldom: the servo loop's setpoints.
 

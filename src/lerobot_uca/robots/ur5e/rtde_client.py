@@ -34,7 +34,7 @@ from lerobot_uca.robots.ur5e.channel import (
 )
 from lerobot_uca.robots.ur5e.dashboard import stop_program
 from lerobot_uca.robots.ur5e.kinematics import Array
-from lerobot_uca.robots.ur5e.limits import Interpolator
+from lerobot_uca.robots.ur5e.limits import Interpolator, is_followed
 from lerobot_uca.robots.ur5e.real_time import prefer_this_thread
 
 # [s] Without new data from the controller: first nothing is commanded, then this ends. A busy computer may well wait
@@ -44,7 +44,6 @@ PACKETS = 3  # that may be missing before that, where they come more slowly than
 SAFEGUARD_STOP = 5  # RTDE's safety_mode
 STOPPED, PAUSED = 1, {3, 4, 5}  # RTDE's runtime_state; the latter are pausing, paused, resuming
 PAUSES_WITHIN = 0.5  # [s]
-FOLLOWS_WITHIN = 0.1  # [rad], besides what a moving setpoint is ahead by servoj's nature
 NEXT_DATA = 0.05  # [s]
 WATCHDOG_RATE = 1.0  # [Hz]: the controller ends the program of a client that has been silent for a second
 FULL_SPEED = 0.99  # of the pendant's speed slider
@@ -239,11 +238,11 @@ class ServoLoop:
             q, qd = np.array(self._receive.getTargetQ()), np.array(self._receive.getTargetQd())
             self._interpolator.go_on_from(q, qd, settings.lookahead)
         q = self._interpolator.step(self._period)
-        behind = float(np.abs(q - np.array(self._receive.getActualQ())).max())
-        if behind > FOLLOWS_WITHIN + np.abs(self._interpolator.qd).max() * (settings.lookahead + patience):
+        actual_q, actual_qd = np.array(self._receive.getActualQ()), np.array(self._receive.getActualQd())
+        if not is_followed(q, self._interpolator.qd, actual_q, actual_qd, settings.lookahead + patience):
             raise ArmStoppedError(
-                f"The arm does not follow, it is {behind:.2f} rad behind: the speed slider below 100 %, reduced mode, "
-                "or something holds it."
+                f"The arm does not follow, it is {np.abs(q - actual_q).max():.2f} rad behind: the speed slider below "
+                "100 %, reduced mode, or something holds it."
             )
         return q
 
