@@ -18,7 +18,7 @@ class EpisodeReport(NamedTuple):
     episode: int
     n_points: NDArray[np.int_]  # (L,) points inside the crop, before sampling
     invalid: NDArray[np.float64]  # (L,) share of pixels without depth, or of points that are not finite
-    low: NDArray[np.float32]  # (3,) lowest corner of the points inside the crop [m]; NaN without any
+    low: NDArray[np.float32]  # (3,) lowest corner of the sampled clouds [m]; NaN where all are empty
     high: NDArray[np.float32]  # (3,) highest corner [m]
     state: NDArray[np.float32]  # (L, S)
     action: NDArray[np.float32]  # (L, A)

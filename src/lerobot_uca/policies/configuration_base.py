@@ -152,9 +152,7 @@ class PointCloudPolicyConfig(PreTrainedConfig):
         modes = [mode.value for mode in NormalizationMode]
         if unknown := [mode for mode in mapping.values() if getattr(mode, "value", mode) not in modes]:
             raise UserError(f"policy.normalization_mapping must name some of {', '.join(modes)}, got '{unknown[0]}'.")
-        self.normalization_mapping = {
-            kind: NormalizationMode(mode) for kind, mode in mapping.items()
-        }  # in Python texts do
+        self.normalization_mapping = {kind: NormalizationMode(mode) for kind, mode in mapping.items()}  # also of texts
 
     def validate_features(self) -> None:
         """Keep of the dataset's features what the policy uses: a cloud, a state and an action.

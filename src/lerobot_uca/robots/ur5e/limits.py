@@ -86,7 +86,7 @@ class Interpolator:
         self._elapsed, self._duration = 0.0, 1.0
 
     def go_on_from(self, q: Array, qd: Array, lookahead: float) -> None:
-        """Go to the target that was set from where a servo stands that has not been heard of for a while.
+        """Go on to the target that was set, from where a servo is after a gap in which it got no setpoints.
 
         `servoj` compares its setpoint with q + lookahead qd: one that stands there neither brakes nor drives it, where
         one at q would be a jump backwards (at 1 rad/s, lookahead 0.1 s and gain 300, of 30 rad/s^2).
