@@ -307,7 +307,9 @@ def test_what_is_not_normalised_is_named(dataset_root, tmp_path, mapping):
 def test_an_adapter_alone_is_not_a_policy(checkpoint, tmp_path):
     shutil.copytree(checkpoint, tmp_path / "adapter")
     (tmp_path / "adapter" / "model.safetensors").rename(tmp_path / "adapter" / "adapter_model.safetensors")
-    with pytest.raises(UserError, match="holds a PEFT adapter alone"):
+    file = tmp_path / "adapter" / "config.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "use_peft": True}))  # as LeRobot writes it
+    with pytest.raises(UserError, match="PEFT trains an adapter alone"):
         load(tmp_path / "adapter")
 
 

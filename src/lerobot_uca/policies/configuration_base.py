@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -121,6 +122,11 @@ class PointCloudPolicyConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        with suppress(ValueError):  # in Python texts do; `validate_sizes` names the one that is no mode
+            self.normalization_mapping = {
+                str(getattr(kind, "value", kind)): NormalizationMode(mode)
+                for kind, mode in self.normalization_mapping.items()
+            }
         self.is_new_training = False
         """Whether a checkpoint is loaded to be trained anew in this process, and not to be resumed. It is not saved."""
 
@@ -143,16 +149,15 @@ class PointCloudPolicyConfig(PreTrainedConfig):
             raise UserError(f"policy.inference must be one of {', '.join(BACKENDS)}, got '{self.inference}'.")
 
     def _validate_normalization(self) -> None:
-        mapping = {str(getattr(kind, "value", kind)): mode for kind, mode in self.normalization_mapping.items()}
+        mapping = self.normalization_mapping
         if not {"STATE", "ACTION"} <= mapping.keys():  # of what is not named LeRobot passes the raw values on
             raise UserError(
                 "policy.normalization_mapping must name STATE (which the cloud is, too) and ACTION, got "
                 f"{', '.join(sorted(mapping)) or 'nothing'}. IDENTITY leaves one as it is."
             )
-        modes = [mode.value for mode in NormalizationMode]
-        if unknown := [mode for mode in mapping.values() if getattr(mode, "value", mode) not in modes]:
-            raise UserError(f"policy.normalization_mapping must name some of {', '.join(modes)}, got '{unknown[0]}'.")
-        self.normalization_mapping = {kind: NormalizationMode(mode) for kind, mode in mapping.items()}  # also of texts
+        if unknown := [mode for mode in mapping.values() if mode not in list(NormalizationMode)]:
+            valid = ", ".join(mode.value for mode in NormalizationMode)
+            raise UserError(f"policy.normalization_mapping must name some of {valid}, got '{unknown[0]}'.")
 
     def validate_features(self) -> None:
         """Keep of the dataset's features what the policy uses: a cloud, a state and an action.

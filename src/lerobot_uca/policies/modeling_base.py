@@ -67,9 +67,6 @@ def _without_inference_mode() -> Iterator[None]:
         yield
 
 
-ADAPTER = "adapter_model.safetensors"
-
-
 class MethodLoss(NamedTuple):
     """A method's loss for each sample, (B,), and its parts to log, each (B,)."""
 
@@ -293,8 +290,6 @@ class PointCloudPolicy(PublishedPolicy, PreTrainedPolicy):
         would remain mostly what the checkpoint was: of 16000 steps, 66 % of it after 600 more.
         """
         if not Path(model_file).is_file():
-            if Path(model_file).with_name(ADAPTER).is_file():
-                raise UserError(f"The checkpoint holds a PEFT adapter alone ('{ADAPTER}'). {NO_PEFT}")
             raise UserError(f"The checkpoint has no weights: '{model_file}' does not exist.")
         try:
             loaded = super()._load_as_safetensor(model, model_file, map_location, strict=True)

@@ -197,12 +197,10 @@ class PointCloudProcessorStep(ProcessorStep):
         transition[TransitionKey.OBSERVATION] = observation
         is_single = _is_single(transition)
         if OBS_STATE in observation:
-            observation[OBS_STATE] = _with_last_dimension(_as_float(observation[OBS_STATE]), cloud)
+            observation[OBS_STATE] = _with_last_dimension(_as_float(observation[OBS_STATE]), cloud, is_single)
         action = transition.get(TransitionKey.ACTION)
         if action is not None:
-            action = _as_float(action)
-            is_numbers = is_single and action.ndim == cloud.ndim - 2  # a window's actions of one dimension, (T,)
-            transition[TransitionKey.ACTION] = action[..., None] if is_numbers else _with_last_dimension(action, cloud)
+            transition[TransitionKey.ACTION] = _with_last_dimension(_as_float(action), cloud, is_single)
         return _with_batch(transition) if is_single else transition
 
     def uniform(self, cloud: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -247,13 +245,14 @@ def _as_float(values: Any) -> Tensor:
     return torch.as_tensor(values).to(torch.float32)
 
 
-def _with_last_dimension(values: Tensor, cloud: Tensor) -> Tensor:
+def _with_last_dimension(values: Tensor, cloud: Tensor, is_single: bool) -> Tensor:
     """A vector of one dimension, which LeRobot reads as a number, as a vector again.
 
-    To a cloud (..., N, C) belong vectors (..., D), so here numbers (...); a batch's actions have T where it has O.
+    To a cloud (..., N, C) belong vectors (..., D), so here numbers (...); an action has T where it has O. Beside
+    a batch of another size stands a vector that has none.
     """
-    is_number = values.ndim == cloud.ndim - 2 and values.shape[:1] == cloud.shape[: min(values.ndim, 1)]
-    return values.unsqueeze(-1) if is_number else values
+    is_of_batch = is_single or values.shape[:1] == cloud.shape[: min(values.ndim, 1)]
+    return values.unsqueeze(-1) if values.ndim == cloud.ndim - 2 and is_of_batch else values
 
 
 def _with_valid_points(cloud: Tensor, mask: Tensor) -> Tensor:

@@ -40,8 +40,9 @@ NEEDED = {**BOUNDS, NormalizationMode.MEAN_STD: ("mean", "std"), NormalizationMo
 
 def needed_statistics(config: PointCloudPolicyConfig) -> dict[str, tuple[int, tuple[str, ...]]]:
     """D and the names of the statistics that the normalisation of each feature needs."""
-    modes = {str(getattr(kind, "value", kind)): mode for kind, mode in config.normalization_mapping.items()}
-    state, action = (NEEDED[NormalizationMode(modes.get(kind, "IDENTITY"))] for kind in ("STATE", "ACTION"))
+    state, action = (
+        NEEDED[config.normalization_mapping.get(kind, NormalizationMode.IDENTITY)] for kind in ("STATE", "ACTION")
+    )
     return {
         OBS_POINT_CLOUD: (config.n_channels, state),
         OBS_STATE: (config.n_states, state),

@@ -142,7 +142,8 @@ class FolderSource(Source):
         if not all(name.isdecimal() for name in whole):
             return range(len(names))
         numbers = [int(name) for name in whole]
-        if twice := [name for name, number in zip(names, numbers, strict=True) if numbers.count(number) > 1]:
+        if len(set(numbers)) < len(numbers):
+            twice = [name for name, number in zip(names, numbers, strict=True) if numbers.count(number) > 1]
             raise UserError(
                 f"'{self.path / 'frames.csv'}' must have one name for each episode, got {' and '.join(twice)}."
             )

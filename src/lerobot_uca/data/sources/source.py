@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +70,7 @@ class Source(ABC):
         numbers = [*self.episodes]
         if numbers and numbers == [*range(numbers[0], numbers[0] + len(numbers))]:
             return f"from {numbers[0]} to {numbers[-1]}"
-        return f"among {', '.join(map(str, numbers)) or 'none'}"
+        return f"among {shorten(', '.join(map(str, numbers)), 100, placeholder=' ...') or 'none'}"
 
     def seen(self, episode: int, frame: int) -> str:
         """The part of the scene that the crop covers in one step, in a line."""
