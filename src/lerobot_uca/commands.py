@@ -72,11 +72,10 @@ def calibrate() -> None:
 
 def edit_dataset() -> None:
     """`lerobot-uca-edit-dataset`."""
-    end_by_signals()
+    _begin()
     from lerobot_uca.data.edit_dataset import run
 
-    with _mistakes_in_one_line():
-        run()
+    run()
 
 
 def saliency() -> None:

@@ -2,6 +2,7 @@
 
 import atexit
 import functools
+import logging
 import multiprocessing
 import os
 import select
@@ -152,7 +153,7 @@ def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
         UserError: if one of them was ended from outside.
     """
     context = multiprocessing.get_context("forkserver")
-    pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=_end_with_parent)
+    pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=_begin_worker)
     try:
         with signals_put_off():
             for _ in range(n_workers):
@@ -162,6 +163,12 @@ def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
         raise UserError("A worker process was ended from outside; was there too little memory?") from error
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    """End with the parent, and leave to it what LeRobot says of missing video decoders: a page in each process."""
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    _end_with_parent()
 
 
 def _end_with_parent() -> None:

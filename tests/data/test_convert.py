@@ -21,6 +21,7 @@ from tests.depth_builders import (
     make_recipe,
     write_depth_dataset,
 )
+from tests.forked import run_command
 
 from lerobot_uca.data import convert as command
 from lerobot_uca.data import edit_dataset
@@ -52,6 +53,16 @@ def config(source, root, **changes):
     return ConvertConfig(
         **{"source": source, "repo_id": "test/clouds", "root": root, "n_points": N_CLOUD_POINTS, **crop, **changes}
     )
+
+
+def test_workers_leave_the_decoders_page_to_the_parent_which_has_one_line(tmp_path):
+    """LeRobot prints a page of tracebacks in every process that opens a dataset without FFmpeg."""
+    write_dataset(tmp_path / "source")
+    options = ("--repo_id=test/clouds", f"--root={tmp_path / 'clouds'}", "--n_points=4", "--num_workers=2")
+    result = run_command("lerobot-uca-convert", f"--source={tmp_path / 'source'}", *options)
+    assert result.returncode == 0
+    assert "Traceback" not in result.stderr
+    assert result.stderr.count("torchcodec") <= 1
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])

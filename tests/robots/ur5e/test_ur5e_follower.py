@@ -759,6 +759,14 @@ def test_fingers_move_only_when_the_arm_is_at_the_first_action(controller, robot
     wait_until(lambda: controller.gripper.get("POS") == CLOSED_COUNT)
 
 
+@pytest.fixture
+def _slow_fingers(monkeypatch):
+    """Which need 11 s to close: a busy machine may take half a second, in which fast ones do, until it disconnects."""
+    for speed in ("SLOWEST", "FASTEST"):
+        monkeypatch.setattr(f"lerobot_uca.robots.ur5e.sim.gripper.{speed}", 20.0)
+
+
+@pytest.mark.usefixtures("_slow_fingers")
 def test_disconnecting_stops_the_fingers(controller, tmp_path):
     with make_robot(controller, tmp_path) as robot:
         robot.send_action(action_at(HOME, gripper=1.0))
@@ -769,6 +777,7 @@ def test_disconnecting_stops_the_fingers(controller, tmp_path):
     assert controller.gripper.get("POS") == stopped
 
 
+@pytest.mark.usefixtures("_slow_fingers")
 def test_a_second_interrupt_stops_the_fingers_too(controller, tmp_path, monkeypatch):
     robot = make_robot(controller, tmp_path)
     robot.connect()
