@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 from huggingface_hub import HfApi, RepoCard, constants, hf_api
+from huggingface_hub.errors import HfHubHTTPError
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts import lerobot_eval
 
 from lerobot_uca.data.collect import CollectConfig, collect
@@ -21,6 +23,7 @@ from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.envs.metaworld import MetaworldPointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
+from lerobot_uca.policies.publishing import retry_of
 from tests.builders import N_POINTS, write_dataset
 from tests.fake_hub import running_hub
 from tests.trust.conftest import train, training_options
@@ -100,6 +103,8 @@ def test_a_pushed_policy_is_evaluated_and_exported_from_the_hub(pushed, tmp_path
     info = json.loads((tmp_path / "eval" / "eval_info.json").read_text())
     assert info["overall"]["n_episodes"] == 1
     assert export("tester/policy", tmp_path / "policy.onnx")["state"] == (2, 9)
+    fetched = {path.parent.name for path in Path(constants.HF_HUB_CACHE).rglob("*.safetensors")}
+    assert not fetched & {"pretrained_model", "training_state"}  # its checkpoints, which may be many times as large
 
 
 def test_a_training_goes_on_from_the_hub(pushed, data, tmp_path):
@@ -124,14 +129,14 @@ def test_a_hostile_repository_cannot_choose_code(hub, pushed, tmp_path):
 def test_a_push_that_fails_leaves_the_checkpoint_and_says_how_to_push_again(hub, data, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(hub, "is_full", True)
     with pytest.raises(UserError, match=r"could not be uploaded: .*Your storage is full") as error:
-        train(*options(data, tmp_path / "run", "tester/full"))
+        train(*options(data, tmp_path / "run", "tester/full"), "--policy.private=true")
     folder = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     assert str(error.value).startswith(f"The policy in '{folder}' is complete but could not be uploaded")
-    assert str(error.value).endswith(f"To upload it: hf upload tester/full {folder} .")
+    assert str(error.value).endswith(f"To upload it: hf upload tester/full {folder} . --private")
     warned = [message for message in caplog.messages if "could not be uploaded" in message]
-    assert [re.search(r"hf upload tester/full \S+ (\S+)", message)[1] for message in warned] == [
-        "checkpoints/000001",
-        "checkpoints/000002",
+    assert [re.search(r"hf upload tester/full \S+ (.+)", message)[1] for message in warned] == [
+        "checkpoints/000001 --private",
+        "checkpoints/000002 --private",
     ]
     assert folder.resolve().parent.name == "000002"
     assert PreTrainedConfig.from_pretrained(folder).type == "uca_flow"
@@ -150,6 +155,14 @@ def test_a_push_that_fails_after_the_weights_says_so_too(hub, data, tmp_path, mo
     folder = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     assert str(error.value).startswith("Pipeline 'policy_preprocessor' is complete")
     assert str(error.value).endswith(f"To upload it: hf upload tester/half {folder} .")
+
+
+def test_other_policies_processors_are_uploaded_as_lerobot_does(hub, monkeypatch):
+    """A line would name a folder that is another policy's."""
+    retry_of.set({"tester/half": "hf upload ..."})
+    monkeypatch.setattr(hub, "is_full", True)
+    with pytest.raises(HfHubHTTPError, match="Your storage is full"):
+        PolicyProcessorPipeline([], name="policy_preprocessor").push_to_hub("tester/act")
 
 
 def test_without_a_network_nothing_is_lost_either(data, tmp_path, monkeypatch):
@@ -186,7 +199,8 @@ def test_a_converted_dataset_is_pushed_and_read_back(hub, data, tmp_path):
 
 def test_a_converted_dataset_that_cannot_be_pushed_stays(hub, data, tmp_path, monkeypatch):
     monkeypatch.setattr(hub, "is_full", True)
-    config = ConvertConfig(source=data, repo_id="tester/more", root=tmp_path / "made", n_points=16, push_to_hub=True)
-    with pytest.raises(UserError, match=r"The dataset in '.*made' is complete but could not be uploaded: .*full"):
-        convert(config)
+    options = {"root": tmp_path / "made", "n_points": 16, "push_to_hub": True, "private": True}
+    said = r"The dataset in '.*made' is complete but could not be uploaded: .*full"
+    with pytest.raises(UserError, match=said + r".*push_to_hub\(private=True, tags=\['point-cloud'\]\) in Python$"):
+        convert(ConvertConfig(source=data, repo_id="tester/more", **options))
     assert len(LeRobotDataset("tester/more", root=tmp_path / "made")) == 39

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import json
 import logging
 import pkgutil
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from accelerate import accelerator
+from lerobot.common.train_utils import load_training_state
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.eval import EvalPipelineConfig
@@ -126,16 +128,21 @@ def test_datasets_with_images_or_text_keep_lerobots_workers(monkeypatch, tmp_pat
     assert workers(monkeypatch, training(tmp_path / "d", tmp_path)) == 4
 
 
-@pytest.mark.parametrize(("switch", "expected"), [("0", "LeRobotDataset"), ("1", "BatchedDataset")])
-def test_switch(switch, expected):
+@pytest.mark.parametrize(("switch", "is_patched"), [("0", False), ("1", True)])
+def test_switch(switch, is_patched):
     code = (
-        "import lerobot_policy_uca_flow\nfrom lerobot.datasets import factory\nprint(factory.LeRobotDataset.__name__)"
+        "import lerobot_policy_uca_flow\nfrom lerobot.datasets import factory\n"
+        "print(hasattr(factory.make_dataset, '__wrapped__'))"
     )
-    assert run_code(code, **{reading.SWITCH: switch}).stdout.strip() == expected
+    assert run_code(code, **{reading.SWITCH: switch}).stdout.strip() == str(is_patched)
 
 
-def test_only_the_dataset_factory_knows_the_batched_dataset():
-    assert factory.LeRobotDataset is BatchedDataset
+@pytest.mark.parametrize("split", [0.0, 0.4])
+def test_other_policies_keep_lerobots_datasets(dataset_root, tmp_path, split):
+    config = training(dataset_root, tmp_path, ACTConfig)
+    config.dataset.eval_split = split
+    assert {type(each) for each in factory.make_train_eval_datasets(cfg=config) if each} == {LeRobotDataset}
+    assert factory.LeRobotDataset is LeRobotDataset
     assert not hasattr(LeRobotDataset, "__getitems__")
 
 
@@ -144,10 +151,10 @@ def test_a_newer_lerobot_is_left_alone():
         "import lerobot; lerobot.__version__ = '0.7.0'\n"
         "import lerobot_policy_uca_flow\n"
         "from lerobot.datasets import factory\n"
-        "print(factory.LeRobotDataset.__name__)"
+        "print(hasattr(factory.make_dataset, '__wrapped__'))"
     )
     result = run_code(code)
-    assert result.stdout.strip() == "LeRobotDataset"
+    assert result.stdout.strip() == "False"
     assert "LeRobot 0.7.0 is too new: this package is made for 0.6.1." in result.stderr
 
 
@@ -168,6 +175,19 @@ def test_an_older_lerobot_that_lacks_modules_is_named_in_one_line():
 def test_lerobot_has_what_is_used_of_it(name):
     """A port to another LeRobot: this says which one is gone."""
     assert callable(pkgutil.resolve_name(name))
+
+
+@pytest.mark.parametrize("name", install.USED_NAMES)
+def test_what_is_replaced_is_called_as_before(name):
+    """By names, too: parameters that a replacement names, LeRobot's function has in the same places."""
+    function = pkgutil.resolve_name(name)
+    function = getattr(function, "__func__", function)
+    known = list(inspect.signature(inspect.unwrap(function)).parameters)
+    while hasattr(function, "__wrapped__"):
+        parameters = inspect.signature(function, follow_wrapped=False).parameters.values()
+        named = [each.name for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
+        assert named == known[: len(named)]
+        function = function.__wrapped__
 
 
 def test_every_private_name_is_listed():
@@ -199,9 +219,10 @@ def test_every_patched_name_is_listed():
 
 def test_installing_twice_changes_nothing():
     install.install()  # again: another test may have loaded a library that sets the hook, as Ray does
-    before = (factory.make_dataset, factory.LeRobotDataset, TrainPipelineConfig.validate, sys.excepthook)
+    before = (factory.make_dataset, factory.make_train_eval_datasets, TrainPipelineConfig.validate, sys.excepthook)
     install.install()
-    assert before == (factory.make_dataset, factory.LeRobotDataset, TrainPipelineConfig.validate, sys.excepthook)
+    after = (factory.make_dataset, factory.make_train_eval_datasets, TrainPipelineConfig.validate, sys.excepthook)
+    assert before == after
 
 
 # Errors and noise ---------------------------------------------------------------------------------------------------
@@ -240,6 +261,36 @@ def test_an_output_folder_that_cannot_be_made_is_refused(dataset_root, tmp_path)
     with pytest.raises(UserError, match="file' is not a writable folder"):
         training(dataset_root, tmp_path / "file").validate()
     training(dataset_root, tmp_path / "file", ACTConfig).validate()  # LeRobot's own policies find out as before
+
+
+def test_a_policy_is_not_uploaded_without_being_saved(dataset_root, tmp_path):
+    """LeRobot uploads from a temporary folder: a failed upload would lose the training."""
+    config = training(dataset_root, tmp_path, save_checkpoint=False)
+    config.policy.push_to_hub, config.policy.repo_id = True, "tester/policy"
+    with pytest.raises(UserError, match="--save_checkpoint=false saves nothing"):
+        config.validate()
+    config.save_checkpoint = True
+    config.validate()
+
+
+def test_what_is_missing_stays_so_for_programs_that_handle_it(tmp_path):
+    with pytest.raises(FileNotFoundError, match="does not hold a policy that can be loaded") as no_file:
+        PreTrainedConfig.from_pretrained(tmp_path)
+    with pytest.raises(NotADirectoryError, match="Training cannot go on from") as no_folder:
+        load_training_state(tmp_path / "none", None, None)
+    assert isinstance(no_file.value, UserError)
+    assert isinstance(no_folder.value, UserError)
+
+
+def test_an_error_that_a_program_makes_of_another_keeps_its_traceback():
+    """Not in a command, where it is LeRobot that wraps an error of this package."""
+    code = (
+        "import sys, lerobot_policy_uca_flow\nfrom lerobot_uca.errors import UserError\n"
+        "raise RuntimeError('stage 3 failed') from UserError('mend it')"
+    )
+    assert "RuntimeError: stage 3 failed" in run_code(code).stderr
+    command = code.replace("import sys, ", "import sys; sys.argv[0] = 'bin/lerobot-train'; import ")
+    assert run_code(command).stderr.strip() == "error: mend it"
 
 
 def test_bfloat16_is_for_processors_that_have_it(monkeypatch, caplog, dataset_root, tmp_path):

@@ -227,7 +227,7 @@ from lerobot.robots import RobotConfig
 assert "ur5e_follower" in RobotConfig.get_known_choices()
 assert {"uca_flow", "dp3", "simple_dp3", "flowpolicy", "mp1"} <= set(PreTrainedConfig.get_known_choices())
 assert {"metaworld_pointcloud", "adroit_pointcloud"} <= set(EnvConfig.get_known_choices())
-assert hasattr(factory.LeRobotDataset, "__getitems__")
+assert hasattr(factory.make_dataset, "__wrapped__")
 brought = {name.split(".")[0] for name in sys.modules} - before
 assert brought - {"openvino_telemetry"} == {"lerobot_policy_uca_flow", "lerobot_uca", "mujoco", "glfw"}, brought
 """
@@ -275,7 +275,7 @@ patches.check_settings = check_settings
 """
     after = """
 from lerobot.datasets import factory
-assert hasattr(factory.LeRobotDataset, "__getitems__")
+assert hasattr(factory.make_dataset, "__wrapped__")
 """
     result = load(before, after)
     assert result.returncode == 0, result.stderr
@@ -294,7 +294,7 @@ try:
 except AttributeError:
     print("refused")
 from lerobot.datasets import factory
-assert hasattr(factory.LeRobotDataset, "__getitems__")
+assert hasattr(factory.make_dataset, "__wrapped__")
 raise SystemExit
 """
     result = load(before, "")

@@ -45,7 +45,7 @@ def test_a_failure_leaves_what_was_there_and_nothing_else(file):
     assert list(file.parent.iterdir()) == [file]
 
 
-def test_a_kill_leaves_what_was_there_and_the_next_writer_tidies_up(file):
+def test_a_kill_leaves_what_was_there_and_a_later_writer_tidies_up(file):
     process = multiprocessing.get_context("spawn").Process(target=killed_while_writing, args=(file,))
     process.start()
     process.join()
@@ -54,7 +54,32 @@ def test_a_kill_leaves_what_was_there_and_the_next_writer_tidies_up(file):
     with whole_file(file) as unfinished:
         unfinished.write_text("new")
     assert file.read_text() == "new"
+    (left,) = set(file.parent.iterdir()) - {file}  # somebody could still be writing it
+    os.utime(left, (0, 0))
+    with whole_file(file) as unfinished:
+        unfinished.write_text("newer")
     assert list(file.parent.iterdir()) == [file]
+
+
+def test_of_two_writers_the_last_ones_file_is_there_whole(file):
+    with whole_file(file) as first:
+        first.write_text("first, whole")
+        with whole_file(file) as second:
+            second.write_text("sec")
+            second.write_text("second, whole")
+        assert file.read_text() == "second, whole"
+    assert file.read_text() == "first, whole"
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_a_link_stays_one_and_permissions_stay(file):
+    file.chmod(0o640)
+    link = file.with_name("link.txt")
+    link.symlink_to(file.name)
+    with whole_file(link) as unfinished:
+        unfinished.write_text("new")
+    assert (link.readlink(), file.read_text()) == (Path(file.name), "new")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o640
 
 
 def test_a_block_that_writes_nothing_is_an_error(file):

@@ -38,11 +38,13 @@ def push_dataset(dataset: Any, *, private: bool | None, tags: list[str]) -> None
     Raises:
         UserError: if it fails; it says how to upload the dataset, which stays.
     """
-    retry = f"LeRobotDataset('{dataset.repo_id}', root='{dataset.root}').push_to_hub() in Python"
+    opened = f"LeRobotDataset('{dataset.repo_id}', root='{dataset.root}')"
+    retry = f"{opened}.push_to_hub(private={private}, tags={tags}) in Python"
     with uploading(f"The dataset in '{dataset.root}'", retry):
         dataset.push_to_hub(private=private, tags=tags)
 
 
-def upload_command(repo_id: str | None, folder: Path, path_in_repo: str = ".") -> str:
-    """The command that uploads a folder to a model repository."""
-    return shlex.join(["hf", "upload", repo_id or "user/name", str(folder), path_in_repo])
+def upload_command(repo_id: str, folder: Path, path_in_repo: str = ".", *, private: bool | None) -> str:
+    """The command that uploads a folder to a model repository, which may have to be made first: as private as asked."""
+    privately = ["--private"] if private else []
+    return shlex.join(["hf", "upload", repo_id, str(folder), path_in_repo, *privately])

@@ -9,14 +9,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from lerobot.common.train_utils import update_last_checkpoint
+from lerobot.common.train_utils import load_training_step, save_checkpoint, update_last_checkpoint
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import pretrained
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
+from tests.builders import make_config
 from tests.trust.conftest import N_STEPS, train, training_options
 
 from lerobot_uca.checkpoints.resuming import without_trace
 from lerobot_uca.errors import UserError
+from lerobot_uca.policies.modeling_uca_flow import UCAFlowPolicy
 
 STATE = (
     "pretrained_model/model.safetensors",
@@ -48,6 +52,28 @@ def test_nothing_but_whole_checkpoints_is_left(trained):
     steps = [f"{step:06d}" for step in range(1, N_STEPS + 1)]
     assert sorted(path.name for path in (trained / "checkpoints").iterdir()) == [*steps, "last"]
     assert (trained / "checkpoints" / "last").readlink() == Path(steps[-1])
+
+
+def test_what_others_wrote_into_a_checkpoint_stays_when_it_is_saved_again(tmp_path):
+    """LeRobot adds its files to a folder; programs of their own save into one that holds other things."""
+
+    def save(*, steps: int) -> None:
+        policy = UCAFlowPolicy(make_config(push_to_hub=False))
+        dataset = DatasetConfig(repo_id="test/random")
+        config = TrainPipelineConfig(dataset=dataset, policy=policy.config, output_dir=tmp_path, steps=steps)
+        save_checkpoint(tmp_path / "run", steps, config, policy, torch.optim.SGD(policy.parameters()))
+
+    save(steps=1)
+    (tmp_path / "run" / "videos").mkdir()
+    (tmp_path / "run" / "videos" / "0.mp4").write_text("film")
+    (tmp_path / "run" / "notes.txt").symlink_to("videos/0.mp4")
+    (tmp_path / "run" / "pretrained_model" / "left").touch()
+    save(steps=2)
+    names = {path.name for path in (tmp_path / "run").iterdir()}
+    assert names == {"notes.txt", "pretrained_model", "training_state", "videos"}
+    assert (tmp_path / "run" / "notes.txt").read_text() == "film"
+    assert not (tmp_path / "run" / "pretrained_model" / "left").exists()
+    assert load_training_step(tmp_path / "run" / "training_state") == 2
 
 
 def test_last_is_never_absent(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 """A checkpoint comes from somewhere else. It cannot choose code to run, nor files outside its folder."""
 
+import importlib
 import json
 import shutil
 import sys
@@ -131,3 +132,37 @@ def test_a_checkpoint_of_another_policy_loads_as_before(tmp_path):
     config = ACTConfig(device="cpu", push_to_hub=False)
     config.save_pretrained(tmp_path)
     assert PreTrainedConfig.from_pretrained(tmp_path).type == "act"
+
+
+PLUGIN_STEP = """
+from pathlib import Path
+from lerobot.processor import IdentityProcessorStep
+
+Path(__file__).with_name("imported").touch()
+
+class Step(IdentityProcessorStep):
+    pass
+"""
+
+
+@pytest.mark.parametrize("is_loaded", [True, False])
+def test_other_policies_keep_the_steps_of_plugins_that_lerobot_has_loaded(tmp_path, monkeypatch, is_loaded):
+    """LeRobot imports a step's module itself, which the plugin need not have done."""
+    package = tmp_path / "lerobot_policy_theirs"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "steps.py").write_text(PLUGIN_STEP)
+    monkeypatch.syspath_prepend(tmp_path)
+    config = {"name": "x", "steps": [{"class": "lerobot_policy_theirs.steps.Step"}]}
+    names = ("lerobot_policy_theirs", "lerobot_policy_theirs.steps")
+    for name in names:
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    if is_loaded:
+        importlib.import_module(names[0])
+        assert isinstance(PolicyProcessorPipeline.from_config(config).steps[0], IdentityProcessorStep)
+    else:
+        with pytest.raises(UserError, match=r"step 'lerobot_policy_theirs\.steps\.Step' is not registered"):
+            PolicyProcessorPipeline.from_config(config)
+    assert (package / "imported").exists() == is_loaded
+    for name in names:
+        sys.modules.pop(name, None)

@@ -205,6 +205,9 @@ def test_the_crop_is_written_into_a_training_configuration(tmp_path):
         with pytest.raises(UserError, match=message):
             write_crop(file, CROP)
         assert file.read_text() == text
+    file.write_bytes("# café".encode("latin-1"))
+    with pytest.raises(UserError, match="cannot be read: 'utf-8' codec"):
+        write_crop(file, CROP)
     for text in ("", "policy:", "policy:\n  depth:"):
         file.write_text(text)
         write_crop(file, CROP)

@@ -17,13 +17,13 @@ from lerobot.utils.random_utils import get_rng_state, set_rng_state
 def cycle_exactly(cycle: Callable[[Any], Iterator[Any]]) -> Callable[[Any], Iterator[Any]]:
     """LeRobot's `cycle`, going on in the epoch and with the random state that a checkpoint has set."""
 
-    def cycle_from_checkpoint(loader: Any) -> Iterator[Any]:
-        sampler = _sampler(loader)
+    def cycle_from_checkpoint(iterable: Any) -> Iterator[Any]:
+        sampler = _sampler(iterable)
         if not isinstance(sampler, EpisodeAwareSampler):
-            return cycle(loader)
+            return cycle(iterable)
         state = sampler.state_dict()
-        loader.iteration = state["epoch"]  # the loader sets the sampler's epoch to it
-        batches = cycle(loader)
+        iterable.iteration = state["epoch"]  # the loader sets the sampler's epoch to it
+        batches = cycle(iterable)
         if state["start_index"] == 0:
             return batches
         with torch.random.fork_rng(devices=[]):  # the unbroken run made this epoch's iterator before the checkpoint

@@ -4,6 +4,7 @@ LeRobot writes a checkpoint under its final name, file by file, and removes the 
 """
 
 import logging
+import shutil
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -25,10 +26,21 @@ def save_whole(save: Callable[..., None]) -> Callable[..., None]:
         try:
             with whole_folder(checkpoint_dir, overwrite=True) as unfinished:
                 save(unfinished, *args, **kwargs)
+                _keep_what_others_wrote(checkpoint_dir, unfinished)
         except (UserError, SafetensorError) as error:  # a full disk, for the most part
             raise UserError(f"The checkpoint could not be written: {error} {_how_to_resume(checkpoint_dir)}") from error
 
     return save_checkpoint
+
+
+def _keep_what_others_wrote(old: Path, new: Path) -> None:
+    """What stands in the folder besides the checkpoint: LeRobot's saving leaves it there, too."""
+    others = [path for path in old.iterdir() if not (new / path.name).exists()] if old.is_dir() else []
+    for path in others:
+        if path.is_dir() and not path.is_symlink():
+            shutil.copytree(path, new / path.name, symlinks=True)
+        else:
+            shutil.copy2(path, new, follow_symlinks=False)
 
 
 def _how_to_resume(checkpoint_dir: Path) -> str:

@@ -5,7 +5,9 @@ step's settings. Some of its registered steps load models by name and run the Py
 (`trust_remote_code`). Both are refused here before anything is imported or made.
 """
 
+import importlib
 import sys
+from contextlib import suppress
 from typing import Any
 
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
@@ -19,6 +21,9 @@ LEROBOT_STEPS = (
 )
 """LeRobot's own steps that a point-cloud policy may load: they only compute."""
 
+PLUGINS = ("lerobot_robot_", "lerobot_camera_", "lerobot_teleoperator_", "lerobot_policy_", "lerobot_env_")
+"""How the modules begin that LeRobot imports by itself, where they are installed."""
+
 
 def check_steps(config: Any, *, of_point_cloud_policy: bool) -> None:
     """Raise a `UserError` for a step that must not be made, by its name.
@@ -26,9 +31,12 @@ def check_steps(config: Any, *, of_point_cloud_policy: bool) -> None:
     Args:
         config: the content of a pipeline's JSON file.
         of_point_cloud_policy: then only `LEROBOT_STEPS` and what an installed plugin has registered are allowed. Other
-            policies may have any registered step, and any whose class the program has imported by itself.
+            policies may have any registered step, and any whose class the program has imported by itself or an
+            installed plugin holds.
     """
     for entry in config["steps"]:
+        if not of_point_cloud_policy:
+            _import_from_plugin(entry)
         name, step = _find(entry)
         if step is None:
             raise UserError(
@@ -44,6 +52,15 @@ def check_steps(config: Any, *, of_point_cloud_policy: bool) -> None:
         file = entry.get("state_file", "")
         if not isinstance(file, str) or set(file) & set("/\\\0") or file == "..":
             raise UserError(f"The checkpoint's processor step '{name}' asks for a file outside its folder: '{file}'.")
+
+
+def _import_from_plugin(entry: Any) -> None:
+    """Import the module of a step's class, as LeRobot does, if it is part of a plugin that LeRobot has loaded."""
+    module = str(entry.get("class", "")).rpartition(".")[0] if isinstance(entry, dict) else ""
+    plugin = module.partition(".")[0]
+    if plugin in sys.modules and plugin.startswith(PLUGINS):
+        with suppress(ImportError):  # it is not found then
+            importlib.import_module(module)
 
 
 def _find(entry: Any) -> tuple[str, type | None]:

@@ -128,7 +128,9 @@ def _folder(checkpoint: str) -> Path:
     folder = Path(checkpoint)
     if not folder.is_dir():
         try:
-            folder = Path(snapshot_download(checkpoint, allow_patterns=["*.json", "*.safetensors"]))
+            # Without its checkpoints, which may have been uploaded, too, into folders of their own.
+            patterns = ["*.json", "*.safetensors"]
+            folder = Path(snapshot_download(checkpoint, allow_patterns=patterns, ignore_patterns=["*/*"]))
         except (HFValidationError, HfHubHTTPError, LocalEntryNotFoundError) as error:
             reason = " ".join(str(error).split())
             raise UserError(

@@ -2,7 +2,7 @@
 
 import logging
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from lerobot_uca.hub import upload_command, uploading
 from lerobot_uca.lerobot_patches.replacing import replace, replace_class_method, replace_method
 from lerobot_uca.policies.configuration_base import PointCloudPolicyConfig
 from lerobot_uca.policies.processor_base import load_processors
-from lerobot_uca.policies.publishing import PublishedPolicy, pushed_folder
+from lerobot_uca.policies.publishing import PublishedPolicy, retry_of
 
 logger = logging.getLogger(__name__)
 
@@ -60,13 +60,11 @@ def report_damaged_checkpoints() -> None:
     """One line names the missing or damaged part, or the wrong option. LeRobot shows a library's traceback."""
 
     def policy(load: Callable[..., Any]) -> Callable[..., Any]:
-        def from_pretrained(
-            cls: type, pretrained_name_or_path: Path | str, cli_overrides: Sequence[str] | None = (), **kwargs: Any
-        ) -> Any:
-            options = ", ".join(f"policy.{option.lstrip('-')}" for option in cli_overrides or ())
+        def from_pretrained(cls: type, pretrained_name_or_path: Path | str, **kwargs: Any) -> Any:
+            options = ", ".join(f"policy.{option.lstrip('-')}" for option in kwargs.get("cli_overrides") or ())
             changed = f" with {options}" if options else ""
             with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded{changed}"):
-                return load(cls, pretrained_name_or_path, cli_overrides=cli_overrides, **kwargs)
+                return load(cls, pretrained_name_or_path, **kwargs)
 
         return from_pretrained
 
@@ -112,11 +110,11 @@ def report_failed_uploads() -> None:
     """A checkpoint that cannot be uploaded is a warning, a policy an error in one line. LeRobot ends in a traceback."""
 
     def checkpoint(push: Callable[..., None]) -> Callable[..., None]:
-        def push_checkpoint_to_hub(checkpoint_dir: Path, repo_id: str, **kwargs: Any) -> None:
-            retry = upload_command(repo_id, checkpoint_dir, f"checkpoints/{checkpoint_dir.name}")
+        def push_checkpoint_to_hub(checkpoint_dir: Path, repo_id: str, *, private: bool | None = None) -> None:
+            retry = upload_command(repo_id, checkpoint_dir, f"checkpoints/{checkpoint_dir.name}", private=private)
             try:
                 with uploading(f"Checkpoint '{checkpoint_dir}'", retry):
-                    push(checkpoint_dir, repo_id, **kwargs)
+                    push(checkpoint_dir, repo_id, private=private)
             except UserError as error:
                 logger.warning("%s", error)  # the training goes on
 
@@ -124,7 +122,10 @@ def report_failed_uploads() -> None:
 
     def processors(push: Callable[..., Any]) -> Callable[..., Any]:
         def push_to_hub(self: DataProcessorPipeline, repo_id: str, **kwargs: Any) -> Any:
-            with uploading(f"Pipeline '{self.name}'", upload_command(repo_id, pushed_folder.get())):
+            retry = retry_of.get().get(repo_id)
+            if retry is None:  # another policy's
+                return push(self, repo_id, **kwargs)
+            with uploading(f"Pipeline '{self.name}'", retry):
                 return push(self, repo_id, **kwargs)
 
         return push_to_hub

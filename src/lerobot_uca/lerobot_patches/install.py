@@ -1,8 +1,6 @@
 """All patches, applied when LeRobot loads the plugin, and the names of LeRobot that this package relies on."""
 
 import logging
-import sys
-from pathlib import Path
 
 from lerobot_uca.lerobot_patches.checkpoints import (
     make_registered_steps_only,
@@ -12,7 +10,7 @@ from lerobot_uca.lerobot_patches.checkpoints import (
     save_checkpoints_whole,
 )
 from lerobot_uca.lerobot_patches.ending import end_together
-from lerobot_uca.lerobot_patches.messages import report_user_errors, shorten_decoder_warning
+from lerobot_uca.lerobot_patches.messages import is_command, report_user_errors, shorten_decoder_warning
 from lerobot_uca.lerobot_patches.reading import normalise_what_is_trained, read_in_batches
 from lerobot_uca.lerobot_patches.recording import record_what_can_be_trained
 from lerobot_uca.lerobot_patches.settings import check_settings, find_configs_by_name
@@ -66,7 +64,7 @@ def install() -> None:
 
 def _install_conveniences() -> None:
     patches = [report_user_errors, shorten_decoder_warning]
-    if Path(sys.argv[0]).stem.startswith("lerobot"):  # one of LeRobot's commands, not somebody's own program
+    if is_command():
         patches.append(end_by_signals)
     if is_supported():
         patches += [

@@ -3,15 +3,23 @@
 import functools
 import logging
 import sys
+from pathlib import Path
 from types import TracebackType
+
+from draccus.utils import DraccusException
 
 from lerobot_uca.errors import UserError
 
 
-def report_user_errors() -> None:
-    """A `UserError` ends the process with its message in one line, also when draccus has wrapped it.
+def is_command() -> bool:
+    """Whether this process is one of LeRobot's commands or of this package's, not somebody's own program."""
+    return Path(sys.argv[0]).stem.startswith("lerobot")
 
-    Python prints a traceback for it.
+
+def report_user_errors() -> None:
+    """A `UserError` ends the process with its message in one line, also when draccus or LeRobot has wrapped it.
+
+    Python prints a traceback for it, and for what somebody's own program has made of it.
     """
     previous = sys.excepthook
     if getattr(previous, "_reports_user_errors", False):
@@ -21,7 +29,7 @@ def report_user_errors() -> None:
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, UserError):
-            cause = cause.__cause__
+            cause = cause.__cause__ if is_command() or isinstance(cause, DraccusException) else None
         if cause is not None:
             print(f"error: {cause}", file=sys.stderr)
         else:

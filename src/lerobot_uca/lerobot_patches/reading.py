@@ -1,9 +1,9 @@
 """The data of a training: reading it in batches, checking and normalising it."""
 
-import functools
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +32,43 @@ SWITCH = "LEROBOT_UCA_BATCHED_READING"
 
 
 def read_in_batches() -> None:
-    """Training reads datasets without cameras in batches. LeRobot reads row by row (issues 2315, 2895, 4392).
+    """A point-cloud policy's training reads datasets without cameras in batches.
 
-    LEROBOT_UCA_BATCHED_READING=0 switches it off.
+    LeRobot reads row by row (issues 2315, 2895, 4392). LEROBOT_UCA_BATCHED_READING=0 switches it off.
     """
-    if os.environ.get(SWITCH, "1") == "0" or factory.LeRobotDataset is BatchedDataset:
+    if os.environ.get(SWITCH, "1") == "0":
         return
+
+    def split(make: Callable[..., Any]) -> Callable[..., Any]:
+        def make_train_eval_datasets(cfg: TrainPipelineConfig) -> Any:
+            with _batched_datasets() if isinstance(cfg.policy, PointCloudPolicyConfig) else nullcontext():
+                return make(cfg)
+
+        return make_train_eval_datasets
+
+    def one(make: Callable[..., Any]) -> Callable[..., Any]:
+        def make_dataset(cfg: TrainPipelineConfig) -> Any:
+            if not isinstance(cfg.policy, PointCloudPolicyConfig):
+                return make(cfg)
+            with _batched_datasets(), reported(f"Dataset '{cfg.dataset.repo_id}' cannot be read"):
+                dataset = make(cfg)
+            _read_without_workers(cfg, dataset)
+            return dataset
+
+        return make_dataset
+
+    replace(factory.make_dataset, one)
+    replace(factory.make_train_eval_datasets, split)
+
+
+@contextmanager
+def _batched_datasets() -> Iterator[None]:
+    stock = factory.LeRobotDataset
     factory.LeRobotDataset = BatchedDataset
-    make_dataset = factory.make_dataset
-
-    @functools.wraps(make_dataset)
-    def make_and_settle(config: TrainPipelineConfig) -> Any:
-        if not isinstance(config.policy, PointCloudPolicyConfig):
-            return make_dataset(config)
-        with reported(f"Dataset '{config.dataset.repo_id}' cannot be read"):
-            dataset = make_dataset(config)
-        _read_without_workers(config, dataset)
-        return dataset
-
-    factory.make_dataset = make_and_settle
+    try:
+        yield
+    finally:
+        factory.LeRobotDataset = stock
 
 
 def normalise_what_is_trained() -> None:
@@ -61,12 +79,12 @@ def normalise_what_is_trained() -> None:
     """
 
     def checked(make: Callable[..., Any]) -> Callable[..., Any]:
-        def make_train_eval_datasets(config: TrainPipelineConfig) -> Any:
-            datasets = make(config)
-            if isinstance(config.policy, PointCloudPolicyConfig):
-                _begin(config, config.policy, datasets[0])
+        def make_train_eval_datasets(cfg: TrainPipelineConfig) -> Any:
+            datasets = make(cfg)
+            if isinstance(cfg.policy, PointCloudPolicyConfig):
+                _begin(cfg, cfg.policy, datasets[0])
                 for dataset in filter(None, datasets):
-                    _normalise_by_chosen_episodes(config, config.policy, dataset)
+                    _normalise_by_chosen_episodes(cfg, cfg.policy, dataset)
             return datasets
 
         return make_train_eval_datasets

@@ -1,4 +1,4 @@
-"""Replacing LeRobot's functions and methods, once each."""
+"""Replacing LeRobot's functions and methods, once by each patch."""
 
 import functools
 import sys
@@ -6,19 +6,21 @@ from collections.abc import Callable
 from typing import Any
 
 Wrap = Callable[[Callable[..., Any]], Callable[..., Any]]
-"""Maps LeRobot's function to the one that replaces it."""
+"""Maps LeRobot's function to the one that replaces it, whose parameters have the same names."""
 
 
 def _wrapped(original: Callable[..., Any], wrap: Wrap) -> Callable[..., Any]:
+    """The new function, or the original where this patch has been applied already."""
+    applied = getattr(original, "_patches", ())
+    if wrap.__qualname__ in applied:
+        return original
     new = functools.wraps(original)(wrap(original))
-    new._is_patched = True  # type: ignore[attr-defined]
+    new._patches = (*applied, wrap.__qualname__)  # type: ignore[attr-defined]
     return new
 
 
 def replace(original: Callable[..., Any], wrap: Wrap) -> None:
     """Replace a function in every module that has imported it by its name."""
-    if getattr(original, "_is_patched", False):
-        return
     new = _wrapped(original, wrap)
     for module in list(sys.modules.values()):
         if getattr(module, "__dict__", {}).get(original.__name__) is original:
@@ -27,13 +29,9 @@ def replace(original: Callable[..., Any], wrap: Wrap) -> None:
 
 def replace_method(owner: type, name: str, wrap: Wrap) -> None:
     """Replace a method of a class."""
-    original = getattr(owner, name)
-    if not getattr(original, "_is_patched", False):
-        setattr(owner, name, _wrapped(original, wrap))
+    setattr(owner, name, _wrapped(getattr(owner, name), wrap))
 
 
 def replace_class_method(owner: type, name: str, wrap: Wrap) -> None:
     """Replace a class method, whose function gets the class first."""
-    original = getattr(owner, name).__func__
-    if not getattr(original, "_is_patched", False):
-        setattr(owner, name, classmethod(_wrapped(original, wrap)))
+    setattr(owner, name, classmethod(_wrapped(getattr(owner, name).__func__, wrap)))

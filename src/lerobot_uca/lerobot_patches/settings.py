@@ -36,6 +36,7 @@ def check_settings() -> None:
             if isinstance(self.policy, PointCloudPolicyConfig):
                 self.policy.validate_sizes()  # before the dataset is read: a horizon of 10^9 would fill the memory
                 _check_precision(self.policy)
+                _check_upload(self, self.policy)
                 if not self.job.is_remote:
                     check_output_folder(self.output_dir)
                     keep_others_out(Path(self.output_dir))
@@ -61,6 +62,15 @@ def _check_precision(policy: PointCloudPolicyConfig) -> None:
         raise UserError(
             "policy.use_amp is lerobot-eval's, training does not look at it: "
             "--policy.dtype=bfloat16 trains in bfloat16."
+        )
+
+
+def _check_upload(config: TrainPipelineConfig, policy: PointCloudPolicyConfig) -> None:
+    """LeRobot uploads from a temporary folder: where that fails, the whole training would be lost."""
+    if policy.push_to_hub and not config.save_checkpoint:
+        raise UserError(
+            "--policy.push_to_hub=true uploads what has been saved, but --save_checkpoint=false saves nothing; "
+            "leave one of them out."
         )
 
 

@@ -4,8 +4,8 @@ import time
 from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -31,8 +31,8 @@ PAPERS = {
 }
 N_TIMED = 20
 
-pushed_folder: ContextVar[Path] = ContextVar("pushed_folder", default=Path("pretrained_model"))
-"""Where the policy lies whose weights were uploaded last; LeRobot uploads its processors next, not saying whose."""
+retry_of: ContextVar[Mapping[str, str]] = ContextVar("retry_of", default=MappingProxyType({}))
+"""The command that uploads a policy again, by its repository: LeRobot uploads its processors next, not saying whose."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,13 @@ class PublishedPolicy:
         Raises:
             UserError: if it fails; it says where the policy lies, and how to upload it.
         """
-        output_dir = cfg.output_dir
+        output_dir, repo_id = cfg.output_dir, self.config.repo_id
         assert output_dir is not None
+        assert repo_id is not None
         folder = output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
-        pushed_folder.set(folder)
-        with uploading(f"The policy in '{folder}'", upload_command(self.config.repo_id, folder)):
+        retry = upload_command(repo_id, folder, private=self.config.private)
+        retry_of.set({repo_id: retry})
+        with uploading(f"The policy in '{folder}'", retry):
             super().push_model_to_hub(cfg, *args, **kwargs)  # type: ignore[misc]
 
     def generate_model_card(  # noqa: PLR0917 (LeRobot's signature)

@@ -110,7 +110,7 @@ def write_crop(file: Path, crop: Crop) -> Path | None:
     try:
         text = file.read_text(encoding="utf-8") if file.exists() else ""
         settings = yaml.safe_load(text)
-    except (OSError, yaml.YAMLError) as error:
+    except (OSError, UnicodeError, yaml.YAMLError) as error:
         raise UserError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from error
     has_comments = "#" in text and yaml.safe_dump(settings, sort_keys=False) != text
     settings = _options(settings, f"'{file}'")
