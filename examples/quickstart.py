@@ -33,7 +33,7 @@ class Step(NamedTuple):
 STEPS = (
     Step(
         f"lerobot-uca-collect {ENVIRONMENT} --repo_id=local/{TASK} --root={DATASET}",
-        "about 30 seconds",
+        "about 15 seconds",
         DATASET,
         DATASET / "meta" / "info.json",
     ),
@@ -47,7 +47,7 @@ STEPS = (
     Step(
         f"lerobot-eval --policy.path={CHECKPOINT} {ENVIRONMENT} --eval.n_episodes={N_EPISODES} --eval.batch_size=2 "
         f"--output_dir={EVALUATION}",
-        "about 90 seconds",
+        "about 30 seconds",
         EVALUATION,
         EVALUATION / "eval_info.json",
     ),

@@ -33,6 +33,7 @@ NOT_RUN = {
     "python benchmarks/load.py": "takes a quarter of an hour, or trains in two processes",
     "accelerate launch": "tests/policies/test_distributed.py runs it, in two processes",
     "lerobot-train --policy.path=": "needs data under another name; tests/test_normalisation.py trains on some",
+    "LEROBOT_UCA_CALIBRATION=calibration lerobot-rollout": "needs an arm; tests/robots rolls out on a simulated one",
     "lerobot-uca-edit-dataset": "needs several episodes; tests/data/test_edit_dataset.py edits a dataset of three",
     "lerobot-uca-view --camera.type=intelrealsense": "needs a camera; tests/robots shows the simulated one's",
     "lerobot-uca-benchmark run": "trains 37 tasks; tests/protocol/test_run.py runs a tiny one",

@@ -57,7 +57,7 @@ class CollectConfig:
     # pickle, or a Minari dataset such as minari:D4RL/door/expert-v2. '{task}' stands for each task.
     expert: str | None = None
     # Weight of the expert's new action against the last one, a first-order filter: 1 for the expert as it is. An expert
-    # that chatters is easier to imitate when it is smoothed, and may even succeed more often (docs/benchmark.md).
+    # that chatters is easier to imitate when it is smoothed (docs/benchmark.md).
     smoothing: float = 1.0
     # Horizontally the hand goes straight to where the expert wants it, equally fast in all directions. By default x and
     # y are limited one by one, as in the papers: far from its aim the hand goes diagonally, the last part along one

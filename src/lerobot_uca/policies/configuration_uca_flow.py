@@ -35,7 +35,8 @@ class UCAFlowConfig(PointCloudPolicyConfig):
     # Path from conditions to actions: unified (the paper's method), cross_attention or adaln (its ablations, of the
     # same size).
     conditioning: str = "unified"
-    # See PointCloudPolicyConfig; measured in benchmarks/inference.py.
+    # What computes the actions: openvino, openvino_bfloat16 or onnxruntime (on a CPU; elsewhere it is PyTorch), eager
+    # (PyTorch) or compile (torch.compile, on a GPU with CUDA graphs); docs/inference.md compares them.
     inference: str = "openvino"
 
     # Supervise the instantaneous velocity v as well (the paper's method); false is its ablation.
