@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-ERRORS = {"UserError", "CalibrationError", "DepthError", "ArmStoppedError", "reported"}
-"""What is called with a message; `reported` puts a library's reason behind it."""
+ERRORS = {"UserError", "CalibrationError", "DepthError", "ArmStoppedError", "reported", "_reported_part"}
+"""What is called with a message; `reported` and `_reported_part` put a library's reason behind it."""
 
 
 def template(node: ast.expr) -> str:

@@ -18,10 +18,7 @@ class UserError(ValueError):
 
 @contextmanager
 def reported(what: str) -> Iterator[None]:
-    """Report whatever a library raises for a damaged or hostile file as a `UserError`: 'what: the reason'.
-
-    A missing file's or folder's is a `FileNotFoundError` or `NotADirectoryError` as well, for programs that handle it.
-    """
+    """Report whatever a library raises for a damaged or hostile file as a `UserError`: 'what: the reason'."""
     try:
         yield
     except UserError:
@@ -29,6 +26,4 @@ def reported(what: str) -> Iterator[None]:
     except Exception as error:
         logger.debug("Reported in one line:", exc_info=True)
         reason = shorten(" ".join(str(error).split()), 300) or "the file is damaged"
-        missing = next((each for each in (FileNotFoundError, NotADirectoryError) if isinstance(error, each)), None)
-        kind = UserError if missing is None else type(UserError.__name__, (UserError, missing), {})
-        raise kind(f"{what}: {type(error).__name__}: {reason}") from error
+        raise UserError(f"{what}: {type(error).__name__}: {reason}") from error

@@ -2,7 +2,8 @@
 
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,28 @@ def make_registered_steps_only() -> None:
     replace(policy_factory.make_pre_post_processors, known)
 
 
+class MissingFileError(UserError, FileNotFoundError):
+    """A checkpoint's missing file, also for programs that then do something else."""
+
+
+class MissingFolderError(UserError, NotADirectoryError):
+    """A missing checkpoint, also for programs that then do something else."""
+
+
+@contextmanager
+def _reported_part(what: str) -> Iterator[None]:
+    try:
+        with reported(what):
+            yield
+    except UserError as error:
+        cause = error.__cause__
+        if isinstance(cause, FileNotFoundError):
+            raise MissingFileError(str(error)) from cause
+        if isinstance(cause, NotADirectoryError):
+            raise MissingFolderError(str(error)) from cause
+        raise
+
+
 def report_damaged_checkpoints() -> None:
     """One line names the missing or damaged part, or the wrong option. LeRobot shows a library's traceback."""
 
@@ -63,14 +86,14 @@ def report_damaged_checkpoints() -> None:
         def from_pretrained(cls: type, pretrained_name_or_path: Path | str, **kwargs: Any) -> Any:
             options = ", ".join(f"policy.{option.lstrip('-')}" for option in kwargs.get("cli_overrides") or ())
             changed = f" with {options}" if options else ""
-            with reported(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded{changed}"):
+            with _reported_part(f"'{pretrained_name_or_path}' does not hold a policy that can be loaded{changed}"):
                 return load(cls, pretrained_name_or_path, **kwargs)
 
         return from_pretrained
 
     def state(load: Callable[..., Any]) -> Callable[..., Any]:
         def load_training_state(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> Any:
-            with reported(f"Training cannot go on from '{checkpoint_dir}'"):
+            with _reported_part(f"Training cannot go on from '{checkpoint_dir}'"):
                 return load(checkpoint_dir, *args, **kwargs)
 
         return load_training_state
