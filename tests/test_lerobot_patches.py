@@ -96,6 +96,14 @@ def test_other_policies_keep_lerobots_workers(monkeypatch, dataset_root, tmp_pat
     assert workers(monkeypatch, training(dataset_root, tmp_path, ACTConfig)) == 4
 
 
+def test_a_streamed_dataset_has_a_worker(monkeypatch, dataset_root, tmp_path, caplog):
+    """Without one LeRobot makes no shard and ends in a traceback; the small configurations ask for none."""
+    config = training(dataset_root, tmp_path, num_workers=0)
+    config.dataset.streaming = True
+    assert workers(monkeypatch, config) == 1
+    assert "A streamed dataset needs workers: num_workers is 1." in caplog.messages
+
+
 def test_datasets_above_the_size_limit_keep_lerobots_workers(monkeypatch, dataset_root, tmp_path):
     monkeypatch.setattr(batched_dataset, "MAX_BYTES", 100)
     assert workers(monkeypatch, training(dataset_root, tmp_path)) == 4

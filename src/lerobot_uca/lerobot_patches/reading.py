@@ -50,6 +50,9 @@ def read_in_batches() -> None:
         def make_dataset(cfg: TrainPipelineConfig) -> Any:
             if not isinstance(cfg.policy, PointCloudPolicyConfig):
                 return make(cfg)
+            if cfg.dataset.streaming and cfg.num_workers == 0:  # LeRobot would make no shard
+                logger.warning("A streamed dataset needs workers: num_workers is 1.")
+                cfg.num_workers = 1
             with _batched_datasets(), reported(f"Dataset '{cfg.dataset.repo_id}' cannot be read"):
                 dataset = make(cfg)
             _read_without_workers(cfg, dataset)
