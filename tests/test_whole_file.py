@@ -82,6 +82,23 @@ def test_a_link_stays_one_and_permissions_stay(file):
     assert stat.S_IMODE(file.stat().st_mode) == 0o640
 
 
+def test_a_link_gives_its_suffix_to_a_file_without_one(tmp_path):
+    """As in the Hub's cache, whose files are named by their contents."""
+    link = tmp_path / "picture.png"
+    link.symlink_to("3f2a")
+    with whole_file(link) as unfinished:
+        assert unfinished.suffix == ".png"
+        unfinished.write_text("new")
+    assert (tmp_path / "3f2a").read_text() == "new"
+
+
+def test_a_link_to_itself_is_replaced(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    with whole_file(tmp_path / "loop") as unfinished:
+        unfinished.write_text("new")
+    assert (tmp_path / "loop").read_text() == "new"
+
+
 def test_a_block_that_writes_nothing_is_an_error(file):
     with pytest.raises(FileNotFoundError), whole_file(file):
         pass

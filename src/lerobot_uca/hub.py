@@ -46,5 +46,5 @@ def push_dataset(dataset: Any, *, private: bool | None, tags: list[str]) -> None
 
 def upload_command(repo_id: str, folder: Path, path_in_repo: str = ".", *, private: bool | None) -> str:
     """The command that uploads a folder to a model repository, which may have to be made first: as private as asked."""
-    privately = ["--private"] if private else []
-    return shlex.join(["hf", "upload", repo_id, str(folder), path_in_repo, *privately])
+    how = {True: ["--private"], False: ["--no-private"], None: []}[private]
+    return shlex.join(["hf", "upload", repo_id, str(folder), path_in_repo, *how])

@@ -103,6 +103,12 @@ def test_a_folder_holds_one_calibration_a_camera(tmp_path):
         read_calibrations(tmp_path)
 
 
+def test_what_a_killed_writer_has_left_is_no_calibration(tmp_path):
+    file = calibration().write(tmp_path)
+    (tmp_path / f".{file.stem}.unfinished-0123abcd.yaml").write_text(file.read_text())
+    assert list(read_calibrations(tmp_path)) == ["front"]
+
+
 @pytest.mark.parametrize("degrees", [0.0, 1e-5, 1.0, 90.0, 179.0])
 def test_how_far_poses_are_apart(degrees):
     a = pose(np.random.default_rng(0))

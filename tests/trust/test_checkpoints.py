@@ -54,8 +54,9 @@ def test_nothing_but_whole_checkpoints_is_left(trained):
     assert (trained / "checkpoints" / "last").readlink() == Path(steps[-1])
 
 
-def test_what_others_wrote_into_a_checkpoint_stays_when_it_is_saved_again(tmp_path):
-    """LeRobot adds its files to a folder; programs of their own save into one that holds other things."""
+@pytest.mark.parametrize("others", [False, True])
+def test_a_checkpoint_is_replaced_alone_and_saved_into_a_programs_own_folder_as_ever(tmp_path, others):
+    """Which holds other things, to which LeRobot adds its files."""
 
     def save(*, steps: int) -> None:
         policy = UCAFlowPolicy(make_config(push_to_hub=False))
@@ -64,15 +65,12 @@ def test_what_others_wrote_into_a_checkpoint_stays_when_it_is_saved_again(tmp_pa
         save_checkpoint(tmp_path / "run", steps, config, policy, torch.optim.SGD(policy.parameters()))
 
     save(steps=1)
-    (tmp_path / "run" / "videos").mkdir()
-    (tmp_path / "run" / "videos" / "0.mp4").write_text("film")
-    (tmp_path / "run" / "notes.txt").symlink_to("videos/0.mp4")
     (tmp_path / "run" / "pretrained_model" / "left").touch()
+    if others:
+        os.mkfifo(tmp_path / "run" / "log.pipe")
     save(steps=2)
-    names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert names == {"notes.txt", "pretrained_model", "training_state", "videos"}
-    assert (tmp_path / "run" / "notes.txt").read_text() == "film"
-    assert not (tmp_path / "run" / "pretrained_model" / "left").exists()
+    assert (tmp_path / "run" / "log.pipe").is_fifo() == others
+    assert (tmp_path / "run" / "pretrained_model" / "left").exists() == others
     assert load_training_step(tmp_path / "run" / "training_state") == 2
 
 

@@ -66,7 +66,7 @@ WAYS = {
 @pytest.mark.parametrize("use", WAYS.values(), ids=WAYS)
 def test_a_step_that_names_code_is_refused_by_name(checkpoint, tmp_path, use, file):
     add_step(checkpoint, {"class": "os.system", "config": {"command": f"touch {tmp_path / 'ran'}"}}, file)
-    with pytest.raises(UserError, match=r"step 'os\.system' is not registered .* neither imported nor run"):
+    with pytest.raises(UserError, match=r"step 'os\.system' is not registered .* was not run"):
         use(checkpoint)
     assert not (tmp_path / "ran").exists()
 
@@ -166,3 +166,34 @@ def test_other_policies_keep_the_steps_of_plugins_that_lerobot_has_loaded(tmp_pa
     assert (package / "imported").exists() == is_loaded
     for name in names:
         sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize(
+    ("step", "is_made", "said"),
+    [
+        ({"registry_name": "device_processor", "class": "lerobot_policy_tool.tool.X"}, True, None),
+        ({"class": "lerobot_policy_tool.__main__.X"}, False, r"__main__\.X' is not registered"),
+        (
+            {"class": "lerobot_policy_tool.broken.X"},
+            False,
+            "cannot be imported from its plugin: RuntimeError: needs CUDA",
+        ),
+        ({"class": "lerobot_policy_tool.none.X"}, False, "cannot be imported from its plugin: ModuleNotFoundError"),
+    ],
+)
+def test_of_a_plugin_nothing_else_is_imported(tmp_path, monkeypatch, step, is_made, said):
+    package = tmp_path / "lerobot_policy_tool"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    for name in ("tool", "__main__"):
+        (package / f"{name}.py").write_text(PLUGIN_STEP)
+    (package / "broken.py").write_text("raise RuntimeError('needs CUDA')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, package.name, importlib.import_module(package.name))
+    config = {"name": "x", "steps": [step]}
+    if is_made:
+        PolicyProcessorPipeline.from_config(config)
+    else:
+        with pytest.raises(UserError, match=said):
+            PolicyProcessorPipeline.from_config(config)
+    assert not (package / "imported").exists()

@@ -4,13 +4,12 @@ LeRobot writes a checkpoint under its final name, file by file, and removes the 
 """
 
 import logging
-import shutil
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR
 from safetensors import SafetensorError
 
 from lerobot_uca.data.whole_folder import whole_folder
@@ -20,27 +19,27 @@ logger = logging.getLogger(__name__)
 
 
 def save_whole(save: Callable[..., None]) -> Callable[..., None]:
-    """LeRobot's `save_checkpoint`, beside the folder and then moved there."""
+    """LeRobot's `save_checkpoint`, beside the folder and then moved there.
+
+    A folder that holds other things as well is a program's own, to which LeRobot adds its files as before.
+    """
 
     def save_checkpoint(checkpoint_dir: Path, *args: Any, **kwargs: Any) -> None:
+        if _holds_other_things(checkpoint_dir):
+            save(checkpoint_dir, *args, **kwargs)
+            return
         try:
             with whole_folder(checkpoint_dir, overwrite=True) as unfinished:
                 save(unfinished, *args, **kwargs)
-                _keep_what_others_wrote(checkpoint_dir, unfinished)
         except (UserError, SafetensorError) as error:  # a full disk, for the most part
             raise UserError(f"The checkpoint could not be written: {error} {_how_to_resume(checkpoint_dir)}") from error
 
     return save_checkpoint
 
 
-def _keep_what_others_wrote(old: Path, new: Path) -> None:
-    """What stands in the folder besides the checkpoint: LeRobot's saving leaves it there, too."""
-    others = [path for path in old.iterdir() if not (new / path.name).exists()] if old.is_dir() else []
-    for path in others:
-        if path.is_dir() and not path.is_symlink():
-            shutil.copytree(path, new / path.name, symlinks=True)
-        else:
-            shutil.copy2(path, new, follow_symlinks=False)
+def _holds_other_things(folder: Path) -> bool:
+    own = (PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR)
+    return folder.is_dir() and any(path.name not in own for path in folder.iterdir())
 
 
 def _how_to_resume(checkpoint_dir: Path) -> str:

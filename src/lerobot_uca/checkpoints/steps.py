@@ -2,17 +2,17 @@
 
 LeRobot imports whatever a step of `policy_preprocessor.json` names (`{"class": "os.system"}`) and calls it with the
 step's settings. Some of its registered steps load models by name and run the Python code that lies beside them
-(`trust_remote_code`). Both are refused here before anything is imported or made.
+(`trust_remote_code`). Both are refused here before anything is imported or made; policies of others may also name steps
+of an installed plugin that has not registered them, whose module is then imported.
 """
 
 import importlib
 import sys
-from contextlib import suppress
 from typing import Any
 
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 
-from lerobot_uca.errors import UserError
+from lerobot_uca.errors import UserError, reported
 
 LEROBOT_STEPS = (
     *("rename_observations_processor", "device_processor", "normalizer_processor", "unnormalizer_processor"),
@@ -41,7 +41,7 @@ def check_steps(config: Any, *, of_point_cloud_policy: bool) -> None:
         if step is None:
             raise UserError(
                 f"The checkpoint's processor step '{name}' is not registered by LeRobot or an installed plugin; "
-                "it was neither imported nor run."
+                "it was not run."
             )
         is_lerobots = step.__module__.partition(".")[0] == "lerobot"
         if of_point_cloud_policy and (name not in LEROBOT_STEPS if is_lerobots else not _is_registered(step)):
@@ -55,11 +55,13 @@ def check_steps(config: Any, *, of_point_cloud_policy: bool) -> None:
 
 
 def _import_from_plugin(entry: Any) -> None:
-    """Import the module of a step's class, as LeRobot does, if it is part of a plugin that LeRobot has loaded."""
-    module = str(entry.get("class", "")).rpartition(".")[0] if isinstance(entry, dict) else ""
-    plugin = module.partition(".")[0]
-    if plugin in sys.modules and plugin.startswith(PLUGINS):
-        with suppress(ImportError):  # it is not found then
+    """Import the module of an unregistered step, as LeRobot does, if it is part of a plugin that LeRobot has loaded."""
+    if not isinstance(entry, dict) or "registry_name" in entry:
+        return
+    module = str(entry.get("class")).rpartition(".")[0]
+    plugin, *inside = module.split(".")
+    if plugin in sys.modules and plugin.startswith(PLUGINS) and "__main__" not in inside:  # which would run a program
+        with reported(f"The checkpoint's processor step '{entry['class']}' cannot be imported from its plugin"):
             importlib.import_module(module)
 
 

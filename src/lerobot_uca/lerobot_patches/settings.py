@@ -69,8 +69,8 @@ def _check_upload(config: TrainPipelineConfig, policy: PointCloudPolicyConfig) -
     """LeRobot uploads from a temporary folder: where that fails, the whole training would be lost."""
     if policy.push_to_hub and not config.save_checkpoint:
         raise UserError(
-            "--policy.push_to_hub=true uploads what has been saved, but --save_checkpoint=false saves nothing; "
-            "leave one of them out."
+            "--policy.push_to_hub=true uploads what has been saved, but --save_checkpoint=false saves nothing: leave "
+            "the latter out, or say --policy.push_to_hub=false."
         )
 
 

@@ -132,7 +132,7 @@ def read_calibrations(folder: Path) -> dict[str, Calibration]:
     Raises:
         CalibrationError: if the folder holds none, two of one name, or one that cannot be right.
     """
-    files = sorted(folder.glob("*.yaml")) if folder.is_dir() else []
+    files = sorted(folder.glob("[!.]*.yaml")) if folder.is_dir() else []
     if not files:
         raise CalibrationError(f"'{folder}' must be a folder of calibrations (*.yaml), made by lerobot-uca-calibrate.")
     found: dict[str, Calibration] = {}

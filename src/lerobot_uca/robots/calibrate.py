@@ -246,7 +246,7 @@ def run(config: CalibrateConfig) -> None:
 
 def _set_aside(folder: Path, replaced: Calibration) -> None:
     """A camera's name stands for one device: the file of the one before is no calibration any longer."""
-    for file in folder.glob("*.yaml"):
+    for file in folder.glob("[!.]*.yaml"):
         values = yaml.safe_load(file.read_text(encoding="utf-8"))
         if (str(values["serial"]), str(values["camera"])) == (replaced.serial, replaced.camera.name):
             aside = file.rename(file.with_name(f"{file.name}.old"))
@@ -256,7 +256,7 @@ def _set_aside(folder: Path, replaced: Calibration) -> None:
 
 
 def _previous(config: CalibrateConfig) -> Calibration | None:
-    if not any(config.folder.glob("*.yaml")):
+    if not any(config.folder.glob("[!.]*.yaml")):
         return None
     try:
         return read_calibrations(config.folder).get(config.camera)
