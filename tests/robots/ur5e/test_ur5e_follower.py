@@ -826,6 +826,7 @@ import os, signal, sys
 from lerobot_uca.robots.ur5e.channel import Settings
 from lerobot_uca.robots.ur5e.limits import JointLimits
 from lerobot_uca.robots.ur5e.rtde_process import RtdeProcess
+signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever runs these tests may ignore it
 limits = JointLimits((-6.0,) * 6, (6.0,) * 6, 1.0, 5.0, 0.2)
 print("connects", flush=True)
 RtdeProcess(Settings(sys.argv[1], os.getpid(), limits, 125, 0.1, 300, 2))
