@@ -234,6 +234,8 @@ def test_a_state_of_another_task():
     )
     with pytest.raises(UserError, match=line):
         AdroitPointCloudEnv("door").reset(options={"initial_state_dict": state})
+    with pytest.raises(UserError, match=r"Adroit door: an initial state has door_body_pos \(3\), .*, got list"):
+        AdroitPointCloudEnv("door").reset(options={"initial_state_dict": [state]})
 
 
 @pytest.mark.parametrize("task", OWN_STATE)

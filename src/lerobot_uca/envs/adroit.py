@@ -206,6 +206,7 @@ class AdroitPointCloudEnv(PointCloudEnv):
         )
         self._own_joints = [joints.index(joint) for joint in self._task.joints]
         self._judge = judge_of(success)
+        self.succeeds_at_the_end = success == "final"
         self._max_episode_steps = self._task.episode_length  # LeRobot reads it
 
     def reset(
@@ -260,7 +261,9 @@ class AdroitPointCloudEnv(PointCloudEnv):
         return [Marker(site.xpos, 0.02, np.array([0.0, 1.0, 0.0]))]
 
 
-def _fields(state: dict[str, Array]) -> str:
+def _fields(state: Any) -> str:
+    if not isinstance(state, dict):
+        return type(state).__name__
     return ", ".join(f"{name} ({np.size(state[name])})" for name in sorted(state))
 
 

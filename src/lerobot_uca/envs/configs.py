@@ -18,7 +18,7 @@ from lerobot_uca.bounds import check_bounds, within
 from lerobot_uca.envs import adroit, metaworld
 from lerobot_uca.envs.experts import adroit_experts, metaworld_experts
 from lerobot_uca.envs.experts.expert import Attempt, attempts_by_seed
-from lerobot_uca.envs.observers import OBSERVERS, depth_name
+from lerobot_uca.envs.observers import depth_name, observer_of
 from lerobot_uca.envs.point_cloud_env import PointCloudEnv
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBJECT_CLOUD, OBS_POINT_CLOUD, POINT_CLOUD
@@ -119,8 +119,7 @@ class PointCloudEnvConfig(EnvConfig):
                 f"env.max_parallel_tasks must be 1, got {self.max_parallel_tasks}: LeRobot's parallel tasks are "
                 "threads that share one policy, which remembers one episode. eval.batch_size runs episodes at once."
             )
-        if self.observation not in OBSERVERS:
-            raise UserError(f"env.observation must be one of {', '.join(OBSERVERS)}, got '{self.observation}'.")
+        observer_of(self.observation)
         self.tasks()
         if self.observation == "depth" and self.recipe() is None:
             raise UserError(

@@ -76,6 +76,17 @@ OBSERVERS: dict[str, type[Observer]] = {
 }
 
 
+def observer_of(observation: str) -> type[Observer]:
+    """The observer of that name in `OBSERVERS`.
+
+    Raises:
+        UserError: for another name.
+    """
+    if observation not in OBSERVERS:
+        raise UserError(f"env.observation must be one of {', '.join(OBSERVERS)}, got '{observation}'.")
+    return OBSERVERS[observation]
+
+
 def depth_name(camera: Camera) -> str:
     """A camera's depth image among an environment's observations; LeRobot puts 'observation.' before it."""
     return f"images.{camera.name}_depth"

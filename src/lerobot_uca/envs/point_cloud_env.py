@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_uca.envs.observers import OBSERVERS, Observer
+from lerobot_uca.envs.observers import Observer, observer_of
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.cameras import Marker, PictureCamera
 from lerobot_uca.point_clouds.geometry import Array, Camera, Crop
@@ -43,6 +43,8 @@ class PointCloudEnv(gym.Env[Any, Any]):
     """The body that the whole robot hangs on."""
     min_successful_steps: ClassVar[int]
     """Successful steps that make an episode a demonstration."""
+    succeeds_at_the_end: bool = False
+    """Whether success is decided after the last action alone."""
     render_mode = "rgb_array"
 
     def __init__(
@@ -60,7 +62,7 @@ class PointCloudEnv(gym.Env[Any, Any]):
     ) -> None:
         self.task, self.task_description = task, description
         self.n_points, self.crop = n_points, crop
-        self.observer: Observer = OBSERVERS[observation](camera, crop, n_points, self.robot)
+        self.observer: Observer = observer_of(observation)(camera, crop, n_points, self.robot)
         self.observation_space = gym.spaces.Dict(
             {
                 self.observer.key: self.observer.space,

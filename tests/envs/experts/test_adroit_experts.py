@@ -115,7 +115,12 @@ def test_a_dataset_of_another_task():
         attempts("door", "minari:local/pen/seeds-v0", first_seed=0)
 
 
-@pytest.mark.parametrize("dataset_id", ["D4RL/nothing/expert-v2", "not an id"])
+def test_a_dataset_without_a_version():
+    with pytest.raises(UserError, match=r"'D4RL/door/expert-v2', with its version, got 'D4RL/door/expert'"):
+        attempts("door", "minari:D4RL/door/expert", first_seed=0)
+
+
+@pytest.mark.parametrize("dataset_id", ["D4RL/nothing/expert-v2", "not an id-v0"])
 def test_a_missing_dataset(dataset_id, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     with pytest.raises(UserError, match=rf"^Minari dataset '{dataset_id}' is not on this computer and could not be "):

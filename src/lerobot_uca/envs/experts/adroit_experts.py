@@ -1,6 +1,7 @@
 """Demonstrators of Adroit's tasks: trained policies, or the episodes of a Minari dataset."""
 
 import logging
+import re
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -71,6 +72,8 @@ def _load(dataset_id: str) -> Any:
         import minari
     except ImportError as error:
         raise UserError("Minari's datasets need minari: pip install 'lerobot_policy_uca_flow[minari]'.") from error
+    if not re.search(r"-v\d+$", dataset_id):
+        raise UserError(f"A Minari dataset is named as 'D4RL/door/expert-v2', with its version, got '{dataset_id}'.")
     try:
         return minari.load_dataset(dataset_id, download=True)
     except Exception as error:  # of almost any kind: its remotes raise what their HTTP libraries do

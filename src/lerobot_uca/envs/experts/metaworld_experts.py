@@ -86,6 +86,38 @@ class PegInsertSide:
         return np.array([*(GAIN * way), effort])
 
 
+class DoorOpen:
+    """Comes down behind the door's handle, hooks it, and pulls until the door is open.
+
+    Meta-World's begins to go down, and to pull, within 12 cm of the handle: where the door is on the left, the hand
+    comes down in front of the handle and stays there. And it rises where a swinging door is 12 cm ahead of the hand,
+    so that the door swings on alone, and at times not far enough.
+    """
+
+    BEHIND = np.array([0.01, 0.02])
+    """Where the hand comes down, from the handle [m]."""
+    NEAR = 0.06
+    """Horizontally within this of that place the hand is lowered [m]."""
+    HIGH = 0.2
+    """Height of the hand above the handle on its way [m]."""
+    HOOKED = 0.04, 0.02, 0.16
+    """It pulls where it is at most so high above the handle, so far in front of it, and so far from it [m]."""
+    AHEAD = 0.05
+    """How far in front of the handle the hand wants to be while it pulls [m]."""
+
+    def get_action(self, observation: NDArray[np.float64]) -> NDArray[Any]:
+        """The action in a state."""
+        way = observation[4:7] - observation[:3]
+        above, in_front, off = -way[2], way[0], float(np.linalg.norm(way[:2]))
+        high, front, far = self.HOOKED
+        if above < high and in_front < front and off < far:
+            way[0] -= self.AHEAD
+        else:
+            way[:2] += self.BEHIND
+            way[2] += self.HIGH if np.linalg.norm(way[:2]) > self.NEAR else 0
+        return np.array([*(GAIN * way), 1.0])
+
+
 class FingersToGoal:
     """Brings the fingers to the goal: Meta-World's expert, told a goal that is higher by as much as they are lower.
 
@@ -115,6 +147,7 @@ class FingersToGoal:
 EXPERTS: Mapping[str, Callable[[], Any]] = {
     "soccer": Soccer,
     "peg-insert-side": PegInsertSide,
+    "door-open": DoorOpen,
     **{task: partial(FingersToGoal, task) for task in ("reach", "reach-wall")},
 }
 """By task."""
