@@ -1,6 +1,9 @@
 """Cells on the GPUs of a machine, and elsewhere: a Ray cluster, and submitit without Slurm."""
 
+import os
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -35,6 +38,8 @@ def test_slurm_without_slurm(monkeypatch):
     [
         (["--slurm=partition"], "--slurm takes options as partition=gpu,gres=gpu:1,time=600, got 'partition'."),
         (["--parallel=0"], "--parallel must be at least 1, got 0."),
+        (["--parallel=0", "--slurm"], "--parallel must be at least 1, got 0."),
+        (["--parallel=-1", "--ray=auto"], "--parallel must be at least 1, got -1."),
     ],
 )
 def test_wrong_options(tmp_path, options, message):
@@ -50,6 +55,75 @@ def test_submitit_runs_each_cell_in_a_task_of_its_own(tmp_path, monkeypatch):
     other = CELL._replace(seed=1)
     launch = on_slurm({"partition": "short"}, cluster="local")
     assert sorted(launch(tmp_path, [CELL, other], None)) == [Ended(CELL, 0), Ended(other, 1)]
+
+
+SLURM = {
+    "srun": "",
+    "sbatch": 'cp "$1" {folder}/submission.sh; echo Submitted batch job 7',
+    "sacct": "echo 'JobID|State|NodeList'; echo '7_0|CANCELLED|n'; echo '7_1|RUNNING|n'; echo '7_2|PENDING|n'",
+    "scancel": 'echo "$1" >> {folder}/cancelled',
+}
+"""The commands of a Slurm on which one task has ended, one runs and one waits."""
+
+
+def test_slurm_tasks_end_with_ctrl_c(tmp_path, monkeypatch):
+    submitit = pytest.importorskip("submitit")
+    for name, command in SLURM.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{command.format(folder=tmp_path)}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(submitit.SlurmJob, "_results_timeout_s", 0)
+    ends = on_slurm({"partition": "short"}, 2)(tmp_path, [CELL._replace(seed=seed) for seed in range(3)], None)
+    assert next(ends).reason.startswith("Slurm gave it up: ")
+
+    def ctrl_c(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(launchers.time, "sleep", ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        next(ends)
+    assert (tmp_path / "cancelled").read_text().split() == ["7_1", "7_2"]
+    assert "#SBATCH --array=0-2%2\n" in (tmp_path / "submission.sh").read_text()
+
+
+def test_a_cell_imports_nothing_of_the_working_directory(tmp_path, monkeypatch):
+    """Where a person has a yaml.py, for example."""
+    (tmp_path / "yaml.py").write_text("raise SystemExit(77)")
+    monkeypatch.chdir(tmp_path)
+    assert launchers.run_process(tmp_path / "no folder", CELL, None) == 1
+
+
+class StubRay(ModuleType):
+    """A Ray whose tasks end one by one, and which keeps how many there were each time."""
+
+    exceptions = SimpleNamespace(RayError=RuntimeError)
+
+    def __init__(self):
+        self.at_once = []
+
+    def remote(self, **_):
+        return lambda _: SimpleNamespace(remote=lambda folder, cell, expert: cell)
+
+    def wait(self, tasks):
+        self.at_once.append(len(tasks))
+        return tasks[:1], tasks[1:]
+
+    def get(self, _):
+        return 0
+
+    def shutdown(self):
+        pass
+
+
+@pytest.mark.parametrize(("n_parallel", "at_once"), [(2, [2, 2, 2, 1]), (None, [4, 3, 2, 1])])
+def test_ray_runs_so_many_cells_at_once(tmp_path, monkeypatch, n_parallel, at_once):
+    ray = StubRay()
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setattr(launchers, "_connect", lambda *_: None)
+    cells = [CELL._replace(seed=seed) for seed in range(4)]
+    ends = on_ray("auto", n_parallel)(make_folder(tmp_path / "run", "cpu").path, cells, None)
+    assert list(ends) == [Ended(cell, 0) for cell in cells]
+    assert ray.at_once == at_once
 
 
 def make_folder(path: Path, device: str | None = None) -> RunFolder:
@@ -93,7 +167,7 @@ def test_each_cell_sees_one_gpu(tmp_path, monkeypatch, n_parallel, seen):
 
 @pytest.mark.parametrize(("setting", "options"), [("paper", ""), ("paper", "partition=a,gres=gpu:1"), ("small", "")])
 def test_slurm_shows_gpus_to_those_who_ask(tmp_path, monkeypatch, capsys, setting, options):
-    monkeypatch.setattr("lerobot_uca.protocol.command.on_slurm", lambda options: lambda *_: iter([Ended(CELL, 2)]))
+    monkeypatch.setattr("lerobot_uca.protocol.command.on_slurm", lambda *_: lambda *_: iter([Ended(CELL, 2)]))
     with pytest.raises(SystemExit):
         main(["run", f"--output={tmp_path}/run", f"--setting={setting}", "--tasks=reach", f"--slurm={options}"])
     is_told = "--slurm asks for none" in capsys.readouterr().out

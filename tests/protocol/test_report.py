@@ -248,6 +248,14 @@ def test_a_record_that_is_none(folder):
             Results.read([folder.path])
 
 
+@pytest.mark.parametrize("text", ["[]", '{"cells": [{}]}', '{"cells": {}}', '{"cells": [{"cell": {}}]}'])
+def test_records_of_a_report_that_are_none(folder, tmp_path, text):
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    (tmp_path / "report" / "cells.json").write_text(text)
+    with pytest.raises(UserError, match=r"cells\.json' is not what is recorded of a cell: it has no cell, minutes"):
+        Results.read([tmp_path / "report"])
+
+
 def test_what_a_killed_process_has_not_finished_is_no_result(tmp_path):
     folder = RunFolder.create(tmp_path / "run", SETTING)
     cell = Cell(REACH, "uca_flow", 0)
@@ -275,6 +283,47 @@ def test_a_report_does_not_replace_a_runs_setting(folder, tmp_path):
     with pytest.raises(UserError, match="is the folder of a run, whose setting would be replaced"):
         main(["report", str(folder.path), f"--output={other.path}"])
     assert (other.path / "setting.json").read_bytes() == before
+
+
+def contents(path):
+    return {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def test_a_report_does_not_replace_rows_that_no_run_holds(folder, tmp_path):
+    """Its run may be gone."""
+    output = tmp_path / "report"
+    main(["report", str(folder.path), f"--output={output}"])
+    before = contents(output)
+    other = RunFolder.create(tmp_path / "other", SETTING)
+    add_cell(other, Cell(WALL, "uca_flow", 0), 100)
+    lost = rf"--output '.*/report' holds results of {REACH} adaln seed 0 that are not in .*/other: choose another"
+    with pytest.raises(UserError, match=lost):
+        main(["report", str(other.path), f"--output={output}"])
+    shutil.rmtree(folder.cell(Cell(REACH, "adaln", 0)).path)
+    add_cell(folder, Cell(REACH, "adaln", 0), 61)  # trained anew
+    with pytest.raises(UserError, match=rf"holds results of {REACH} adaln seed 0 that are not in"):
+        main(["report", str(folder.path), f"--output={output}", "--policies=uca_flow"])
+    assert contents(output) == before
+
+
+def test_a_report_grows_with_its_run(folder, tmp_path):
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    add_cell(folder, Cell(REACH, "uca_flow", 2), 70)
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    main(["report", str(folder.path), f"--output={tmp_path}/report", "--policies=adaln"])
+
+
+def test_a_report_does_not_mix_with_other_things(folder, tmp_path):
+    output = tmp_path / "mine"
+    output.mkdir()
+    main(["report", str(folder.path), f"--output={output}"])  # an empty folder will do
+    kept = output / "episodes_of_mine.csv"
+    kept.touch()
+    main(["report", str(folder.path), f"--output={output}"])
+    assert kept.exists()
+    (output / "cells.json").unlink()
+    with pytest.raises(UserError, match=r"--output '.*/mine' holds other things than a report: choose a new or empty"):
+        main(["report", str(folder.path), f"--output={output}"])
 
 
 def test_a_report_leaves_no_figures_of_the_one_before(folder, tmp_path):

@@ -61,3 +61,6 @@ def test_a_file_of_something_else(tmp_path):
     path.write_text("a,b\n1,2\n")
     (corrupt,) = read_rows(path)
     assert "the header lacks task, policy" in str(corrupt)
+    path.write_text("a" * 200_000)
+    (corrupt,) = read_rows(path)
+    assert str(corrupt) == f"{path}, line 1 is left out: field larger than field limit (131072)."

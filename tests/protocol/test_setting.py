@@ -111,6 +111,14 @@ GOOD = {"description": "-", "batch_size": 8, "lengths": {"metaworld": {"steps": 
         ({**GOOD, "policy": {"since": date(2024, 1, 1)}}, "what no setting can hold: Object of type date is not JSON"),
         ({**GOOD, "policy": {"optimizer_lr": float("nan")}}, "what no setting can hold: Out of range float values"),
         (
+            {**GOOD, "policy": {"type": "simple_dp3"}},
+            "policy may hold any option but type, which --policies names, got",
+        ),
+        ({**GOOD, "benchmarks": {"metaworld": {"type": "dp3"}}}, "benchmarks.metaworld may hold any option but type"),
+        ({**GOOD, "policies": {"mp1": {"type": "dp3"}}}, "policies.mp1 may hold any option but type"),
+        ({**GOOD, "smoothing": {"adroit/pen": True}}, "above 0 and up to 1 by 'benchmark/task', got adroit/pen: True"),
+        ({**GOOD, "pushes": {"metaworld": False}}, "by benchmark, metaworld alone, got metaworld: False"),
+        (
             {**GOOD, "policies": {"uca": {}}},
             "policies holds options by type (dp3, flowpolicy, mp1, simple_dp3, uca_flow",
         ),

@@ -43,6 +43,12 @@ def test_a_command_that_fails_says_why(tmp_path):
     assert "working\n" in (tmp_path / "log").read_text()
 
 
+def test_nothing_of_the_working_directory_is_imported(tmp_path, monkeypatch):
+    (tmp_path / "ctypes.py").write_text("raise SystemExit('a person's own')")
+    monkeypatch.chdir(tmp_path)
+    run_python("print('done')", tmp_path / "log")
+
+
 def test_a_command_that_is_killed_for_memory(tmp_path):
     with pytest.raises(CellError, match="python was killed by SIGKILL, as processes are when the memory is full"):
         run_python("import os; print('at work', flush=True); os.kill(os.getpid(), 9)", tmp_path / "log")

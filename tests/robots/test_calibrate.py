@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.calibration import CalibrationError, pose_difference, read_calibrations
+from lerobot_uca.point_clouds.registration import fit_board
 from lerobot_uca.robots import calibrate as command
 from lerobot_uca.robots.calibrate import BoardConfig, CalibrateConfig, calibrate
 
@@ -117,6 +118,26 @@ def test_pictures_without_the_board_are_left_out_and_named(tmp_path, caplog):
     assert "1 of 10 pictures show too little of the board: 3.png." in caplog.messages
 
 
+def test_a_row_of_corners_is_too_little_of_the_board():
+    """It may turn about the row; OpenCV's pose of it has NaN."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    charuco = cv2.aruco.CharucoBoard(BOARD.squares, BOARD.square, BOARD.marker, dictionary)
+    detector, picture = cv2.aruco.CharucoDetector(charuco), np.full((480, 640), 255, np.uint8)
+    picture[40:440, 40:600] = charuco.generateImage((560, 400))
+    assert command._board_pose(detector, charuco, picture, K) is not None
+    picture[200:] = 255  # two rows of squares are left
+    assert len(detector.detectBoard(picture)[1]) == command.MIN_CORNERS
+    assert command._board_pose(detector, charuco, picture, K) is None
+
+
+def test_poses_that_are_not_finite_are_refused():
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    boards = poses.copy()
+    boards[3, 0, 3] = np.nan
+    with pytest.raises(CalibrationError, match="finite numbers, got others in 0 poses of the robot and 1 of the board"):
+        fit_board(poses, boards, on_arm=False)
+
+
 def run(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["lerobot-uca-calibrate", *arguments])
     command.run()
@@ -152,6 +173,20 @@ def test_a_camera_that_is_replaced(tmp_path, monkeypatch, caplog):
         read_calibrations(folder)
 
 
+def test_a_camera_that_gets_another_name(tmp_path, monkeypatch, caplog):
+    """The device has one file, which held the former name's calibration."""
+    folder, points = tmp_path / "cameras", write_points(tmp_path / "touched.csv", pixels=False)
+    options = ["--serial=111", "--intrinsics=[640,480,605,604,321,243]", f"--folder={folder}", f"--points={points}"]
+    run(monkeypatch, "--camera=front", *options)
+    before = (folder / "111.yaml").read_text()
+    run(monkeypatch, "--camera=side", *options)
+    assert list(read_calibrations(folder)) == ["side"]
+    assert (folder / "111.yaml.old").read_text() == before
+    assert "Camera 'front' was the device 111: its file is" in caplog.text
+    run(monkeypatch, "--camera=side", *options)
+    assert (folder / "111.yaml.old").read_text() == before
+
+
 def test_a_spreadsheets_csv(tmp_path):
     points = write_points(tmp_path / "touched.csv", pixels=False)
     expected = calibrate(settings(points=points))[0]
@@ -175,9 +210,17 @@ def bad_inputs(tmp_path):
     no_image, nan = tmp_path / "no_image", tmp_path / "nan.csv"
     no_image.mkdir()
     write_csv(no_image / "poses.csv", command.POSE, [[0, 0, 0, 0, 0, 0]])
+    short = tmp_path / "short"
+    short.mkdir()
+    write_csv(short / "poses.csv", (*command.POSE, "image"), [[0, 0, 0, 0, 0, 0, "0.png"], [0, 0, 0, 0, 0, 0]])
+    cv2.imwrite(str(short / "0.png"), np.zeros((480, 640), np.uint8))
+    huge = tmp_path / "huge.csv"
+    huge.write_text("x" * 200_000)
     nan.write_text("base_x,base_y,base_z,camera_x,camera_y,camera_z\n1,2,3,4,5,6\n1,2,nan,4,5,6\n")
     return {
         "must have the column image, the names of the pictures, got x, y, z": settings(board_folder=no_image),
+        "must have the name of a picture in each row, got none in row 2": settings(board_folder=short),
+        "huge.csv' cannot be read: field larger than field limit": settings(points=huge),
         r"must hold finite numbers in base_x, base_y, base_z, got \[ 1.  2. nan\] in row 2": settings(points=nan),
         "must be one of OpenCV's, such as DICT_4X4_50, got 'CharucoBoard'": settings(
             board_folder=no_picture, board=dataclasses.replace(BOARD, dictionary="CharucoBoard")

@@ -15,6 +15,7 @@ from tests.depth_builders import CROP, live_frame, make_calibration, make_recipe
 from tests.forked import run_code
 from tests.robots.conftest import wait_until
 
+from lerobot_uca.data.sources.lerobot_source import LeRobotSource
 from lerobot_uca.envs.configs import MetaworldPointCloudConfig
 from lerobot_uca.errors import UserError
 from lerobot_uca.point_clouds.geometry import Crop
@@ -56,10 +57,10 @@ def test_colours_are_the_points_own_where_they_have_some():
 
 def test_an_episode_of_a_folder_by_its_number_and_by_default_the_first(tmp_path):
     for index in range(4):
-        np.savez(tmp_path / f"{index}.npz", points=np.full((5, 3), index / 10, np.float32))
+        np.savez(tmp_path / f"{index}.npz", points=np.full((5, 3), (1 + index) / 10, np.float32))
     rows = ["file,episode,state_x,action_x", *(f"{index}.npz,{1 + index // 2},0,0" for index in range(4))]
     (tmp_path / "frames.csv").write_text("\n".join(rows) + "\n")
-    for episode, first in ((None, 0.0), (1, 0.0), (2, 0.2)):
+    for episode, first in ((None, 0.1), (1, 0.1), (2, 0.3)):
         assert next(clouds_of(ViewConfig(source=tmp_path, episode=episode)))[0, 0] == np.float32(first)
     with pytest.raises(UserError, match=r"^episode must be from 1 to 2, got 0\."):
         next(clouds_of(ViewConfig(source=tmp_path, episode=0)))
@@ -85,6 +86,19 @@ def test_a_picture_and_a_recording(depth_dataset, tmp_path, monkeypatch, capsys)
     assert f"Written: {picture}, {recording}" in capsys.readouterr().out
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert recording.read_bytes().startswith(b"RRF")
+
+
+@pytest.mark.usefixtures("calibrated")
+@pytest.mark.parametrize(("options", "n_frames"), [({}, 1), ({"rrd": "cloud.rrd"}, 6)], ids=["picture", "both"])
+def test_a_picture_reads_one_frame(depth_dataset, tmp_path, monkeypatch, options, n_frames):
+    if options:
+        pytest.importorskip("rerun")
+    frame, read = LeRobotSource._frame, []
+    monkeypatch.setattr(LeRobotSource, "_frame", lambda self, item: read.append(item) or frame(self, item))
+    files = {name: tmp_path / file for name, file in {"output": "cloud.png", **options}.items()}
+    assert list(view(ViewConfig(source=depth_dataset.root, **files))) == []
+    assert len(read) == n_frames
+    assert all(file.exists() for file in files.values())
 
 
 WINDOW = (1100, 700)
@@ -249,6 +263,25 @@ def test_a_camera_that_dies_is_said_in_a_line(monkeypatch):
     with pytest.raises(UserError, match=r"Camera 'front' gives no cloud: RealSense read thread is not running\."):
         next(clouds)
     assert not camera.is_connected
+
+
+@pytest.mark.usefixtures("calibrated")
+def test_a_camera_that_is_not_there_is_said_in_a_line(monkeypatch):
+    def connect():
+        raise ConnectionError("Failed to open it.")
+
+    config, camera = SimpleNamespace(use_depth=True, type="stub"), DyingCamera()
+    camera.connect = connect
+    monkeypatch.setattr(live_camera, "make_cameras_from_configs", lambda _: {"front": camera})
+    with pytest.raises(UserError, match=r"^Camera 'front' cannot be opened: Failed to open it\."):
+        next(live_camera.live_clouds(config, "front", None, CROP, 100))
+
+    def make(_):
+        raise ValueError("No RealSense camera found with name 'D435'")
+
+    monkeypatch.setattr(live_camera, "make_cameras_from_configs", make)
+    with pytest.raises(UserError, match=r"^Camera 'front' cannot be opened: ValueError: No RealSense camera found"):
+        next(live_camera.live_clouds(config, "front", None, CROP, 100))
 
 
 def test_wrong_input(depth_dataset, tmp_path, monkeypatch):

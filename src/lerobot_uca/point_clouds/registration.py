@@ -68,8 +68,8 @@ def fit_board(X_base_tool: Array, X_camera_board: Array, *, on_arm: bool) -> Fit
     Martin's method. The residual is how far the board, which stands still in one of the two frames, moves in it.
 
     Raises:
-        CalibrationError: for fewer than 5 poses, if the tool turned too little about a second axis, and for poses that
-            do not fit.
+        CalibrationError: for fewer than 5 poses, numbers that are not finite, if the tool turned too little about a
+            second axis, and for poses that do not fit.
     """
     import cv2  # slow to import
 
@@ -77,6 +77,11 @@ def fit_board(X_base_tool: Array, X_camera_board: Array, *, on_arm: bool) -> Fit
         raise CalibrationError(
             f"The board must be seen in at least {MIN_POSES} poses of the robot, got {len(X_camera_board)} views of it "
             f"and {len(X_base_tool)} poses."
+        )
+    if not (np.isfinite(X_base_tool).all() and np.isfinite(X_camera_board).all()):
+        raise CalibrationError(
+            f"Poses must hold finite numbers, got others in {_n_bad(X_base_tool)} poses of the robot and "
+            f"{_n_bad(X_camera_board)} of the board."
         )
     turn = _second_axis(X_base_tool)
     if turn < MIN_ROTATION:
@@ -112,6 +117,10 @@ def _fitting(fit: Fit, hint: str) -> Fit:
         got = ", ".join(f"{value:.1f} {unit}" for unit, value in residual.items())
         raise CalibrationError(f"The residual must be at most {MAX_MM:g} mm and {MAX_DEG:g} deg, got {got}. {hint}")
     return fit
+
+
+def _n_bad(poses: Array) -> int:
+    return int((~np.isfinite(poses)).any(axis=(1, 2)).sum())
 
 
 def _second_axis(poses: Array) -> float:

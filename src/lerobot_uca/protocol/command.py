@@ -58,7 +58,9 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
         "--setting", default="small", help="small, paper, a YAML file, or a run's setting.json (default: small)"
     )
     parser.add_argument("--expert", help="who demonstrates Adroit's tasks, as for lerobot-uca-collect")
-    parser.add_argument("--parallel", type=int, help="cells at once (default: one a core, or one a GPU if one is used)")
+    parser.add_argument(
+        "--parallel", type=int, help="cells at once (default: one a core, or a GPU if used; or a cluster's)"
+    )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--ray", metavar="ADDRESS", help="run on a Ray cluster instead, at HOST:PORT or auto")
     where.add_argument(
@@ -72,6 +74,8 @@ def _add_run(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
 
 
 def _run(args: argparse.Namespace) -> None:
+    if args.parallel is not None and args.parallel < 1:
+        raise UserError(f"--parallel must be at least 1, got {args.parallel}.")
     cells = grid(args.suite, args.tasks, args.policies, args.seeds)
     folder = make_folder(args.output, args.setting)
     expert = args.expert
@@ -83,7 +87,7 @@ def _run(args: argparse.Namespace) -> None:
 
 def _launcher(args: argparse.Namespace, folder: RunFolder) -> Launcher:
     if args.ray is not None:
-        return on_ray(args.ray)
+        return on_ray(args.ray, args.parallel)
     if args.slurm is not None:
         pairs = [option.partition("=") for option in args.slurm.split(",") if option]
         if not all(name and value for name, _, value in pairs):
@@ -94,9 +98,7 @@ def _launcher(args: argparse.Namespace, folder: RunFolder) -> Launcher:
                 f"Setting '{folder.setting.name}' computes on a GPU, but --slurm asks for none: many clusters show a "
                 "job none then, and it trains on the CPU. To ask: gres=gpu:1."
             )
-        return on_slurm({name: value for name, _, value in pairs})
-    if args.parallel is not None and args.parallel < 1:
-        raise UserError(f"--parallel must be at least 1, got {args.parallel}.")
+        return on_slurm({name: value for name, _, value in pairs}, args.parallel)
     return local(args.parallel)
 
 

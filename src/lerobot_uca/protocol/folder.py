@@ -28,6 +28,8 @@ from lerobot_uca.whole_file import whole_file
 
 RECORDED = ("cell", "minutes", "inference", "hardware")
 """What reports need of a cell.json."""
+SETTING, RECORDS = "setting.json", "cells.json"
+"""A run's or a report's file of its setting, and a report's of the records of its cells."""
 
 
 class CellFolder:
@@ -73,7 +75,7 @@ class RunFolder:
         Raises:
             UserError: if it cannot be written, or was made with another setting.
         """
-        file = path / "setting.json"
+        file = path / SETTING
         values = setting.as_values()
         try:
             (path / "demonstrations").mkdir(parents=True, exist_ok=True)
@@ -96,7 +98,7 @@ class RunFolder:
         Raises:
             UserError: if it is not one.
         """
-        file = path / "setting.json"
+        file = path / SETTING
         if not file.is_file():
             raise UserError(f"'{path}' is not the folder of a benchmark run: it has no setting.json.")
         return cls(path, Setting.from_values(path.name, read_json(file)))
@@ -130,13 +132,13 @@ class RunFolder:
 
     def records(self) -> Iterator[dict[str, Any]]:
         """The record of each finished cell."""
-        for path in self.path.glob("cells.json"):
-            yield from read_json(path)["cells"]
+        for path in self.path.glob(RECORDS):
+            values = read_json(path)
+            records = values.get("cells") if isinstance(values, dict) else None
+            for record in records if isinstance(records, list) else [None]:
+                yield _checked(path, record)
         for path in sorted(self.path.glob("cells/*/*/*/*/cell.json")):
-            record = read_json(path)
-            if not is_record(record):
-                raise UserError(f"'{path}' is not what is recorded of a cell: it has no {', '.join(RECORDED)}.")
-            yield record
+            yield _checked(path, read_json(path))
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -148,7 +150,14 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
 
 def is_record(values: Any) -> bool:
     """Whether these are what a finished cell's cell.json holds, as far as reports need it."""
-    return isinstance(values, dict) and values.keys() >= {*RECORDED}
+    is_whole = isinstance(values, dict) and values.keys() >= {*RECORDED}
+    return is_whole and isinstance(values["cell"], dict) and values["cell"].keys() == {*Cell._fields}
+
+
+def _checked(path: Path, record: Any) -> dict[str, Any]:
+    if not is_record(record):
+        raise UserError(f"'{path}' is not what is recorded of a cell: it has no {', '.join(RECORDED)}.")
+    return record
 
 
 def read_json(path: Path) -> Any:

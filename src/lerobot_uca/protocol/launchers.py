@@ -51,7 +51,8 @@ def run_process(folder: Path, cell: Cell, expert: str | None) -> int:
 
 def _start(folder: Path, cell: Cell, expert: str | None, gpu: str | None = None) -> "subprocess.Popen[bytes]":
     arguments = [str(folder), cell.task, cell.policy, str(cell.seed), *([expert] if expert else [])]
-    command = [sys.executable, "-m", "lerobot_uca.protocol.run_cell", *arguments]
+    # -P: of the working directory, whose yaml.py may be anything, nothing is imported
+    command = [sys.executable, "-P", "-m", "lerobot_uca.protocol.run_cell", *arguments]
     chosen = {} if gpu is None else {VISIBLE_GPUS: gpu}
     return subprocess.Popen(command, env={**os.environ, **ONE_THREAD, **chosen, **tied()})  # noqa: S603
 
@@ -103,8 +104,12 @@ def _places(setting: Setting) -> list[str | None]:
     return [*(visible.split(",") if visible else map(str, range(n_gpus)))][:n_gpus]
 
 
-def on_ray(address: str) -> Launcher:
+def on_ray(address: str, n_parallel: int | None = None) -> Launcher:
     """Run on a Ray cluster whose nodes share the disk. A cell whose node dies is begun anew on another and goes on.
+
+    Args:
+        address: HOST:PORT, or auto.
+        n_parallel: cells at once; by default as many as the cluster takes.
 
     Raises:
         UserError: if Ray is not installed, or the address does not answer.
@@ -118,8 +123,12 @@ def on_ray(address: str) -> Launcher:
     def launch(folder: Path, cells: Sequence[Cell], expert: str | None) -> Iterator[Ended]:
         needs_gpu = RunFolder.open(folder).setting.policy.get("device") != "cpu" and ray.cluster_resources().get("GPU")
         remote = ray.remote(num_cpus=1, num_gpus=1 if needs_gpu else 0, max_retries=N_RETRIES)(_claim_and_run)
-        running = {remote.remote(folder, cell, expert): cell for cell in cells}
-        while running:
+        waiting = deque(cells)
+        running: dict[Any, Cell] = {}
+        while waiting or running:
+            while waiting and len(running) < (n_parallel or len(cells)):
+                cell = waiting.popleft()
+                running[remote.remote(folder, cell, expert)] = cell
             (done, *_), _ = ray.wait(list(running))
             cell = running.pop(done)
             try:
@@ -154,11 +163,14 @@ def _connect(ray: Any, address: str) -> None:
         ) from error
 
 
-def on_slurm(options: Mapping[str, str], cluster: str = "slurm") -> Launcher:
+def on_slurm(options: Mapping[str, str], n_parallel: int | None = None, cluster: str = "slurm") -> Launcher:
     """Run as a Slurm array, one task a cell, through submitit. The nodes share the disk.
+
+    Tasks that have not ended are cancelled when the launcher is left, with Ctrl-C for example.
 
     Args:
         options: of sbatch, by their long names: partition, time, gres, ...
+        n_parallel: cells at once; by default as many as submitit lets an array have.
         cluster: submitit's name of the scheduler; 'local' runs the tasks here.
 
     Raises:
@@ -175,15 +187,22 @@ def on_slurm(options: Mapping[str, str], cluster: str = "slurm") -> Launcher:
         executor = submitit.AutoExecutor(folder / "slurm", cluster=cluster)
         executor.update_parameters(name="lerobot-uca-benchmark", cpus_per_task=1, timeout_min=MAX_MINUTES)
         executor.update_parameters(slurm_additional_parameters=dict(options))
+        executor.update_parameters(slurm_setup=["export PYTHONSAFEPATH=1"])  # as -P above
+        if n_parallel is not None:
+            executor.update_parameters(slurm_array_parallelism=n_parallel)
         jobs = executor.map_array(run_process, *zip(*((folder, cell, expert) for cell in cells), strict=True))
         running = dict(zip(jobs, cells, strict=True))
-        while running:
-            for job in [job for job in running if job.done()]:
-                cell = running.pop(job)
-                try:
-                    yield Ended(cell, job.result())
-                except (submitit.core.utils.FailedJobError, submitit.core.utils.UncompletedJobError) as error:
-                    yield Ended(cell, Outcome.FAILED, f"Slurm gave it up: {' '.join(str(error).split())[:300]}")
-            time.sleep(POLL_SECONDS)
+        try:
+            while running:
+                for job in [job for job in running if job.done()]:
+                    cell = running.pop(job)
+                    try:
+                        yield Ended(cell, job.result())
+                    except (submitit.core.utils.FailedJobError, submitit.core.utils.UncompletedJobError) as error:
+                        yield Ended(cell, Outcome.FAILED, f"Slurm gave it up: {' '.join(str(error).split())[:300]}")
+                time.sleep(POLL_SECONDS)
+        finally:
+            for job in running:
+                job.cancel(check=False)  # it may have ended meanwhile
 
     return launch

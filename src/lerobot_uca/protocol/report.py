@@ -10,6 +10,7 @@ from lerobot_uca.errors import UserError
 from lerobot_uca.protocol import rollouts
 from lerobot_uca.protocol.cells import POLICIES
 from lerobot_uca.protocol.figures import CAPTIONS, draw, remove
+from lerobot_uca.protocol.folder import RECORDS, SETTING
 from lerobot_uca.protocol.results import Results
 from lerobot_uca.protocol.tables import TABLES, setting_of
 
@@ -39,14 +40,15 @@ def report(
         rollouts_of: tasks of which an episode of each policy is shown; for that it is run again.
 
     Raises:
-        UserError: if there are no results, or no checkpoint for rollouts, or the folder cannot be written or is
-            itself reported.
+        UserError: if there are no results, or no checkpoint for rollouts, or the folder cannot be written, is itself
+            reported, or holds anything but an earlier report of the same results.
     """
     if output.resolve() in [run.resolve() for run in runs]:
         raise UserError(f"--output '{output}' is what is to be reported: its rows would be replaced. Choose another.")
     if (output / "cells").exists():
         raise UserError(f"--output '{output}' is the folder of a run, whose setting would be replaced. Choose another.")
     results, corrupt = Results.read(runs)
+    _check_output(output, results, runs)
     for line in corrupt:
         print(f"warning: {line}", file=sys.stderr)
     results, tuning = results.of(lambda cell: cell.policy in policies).without_tuning()
@@ -79,6 +81,30 @@ def report(
     except OSError as error:
         raise UserError(f"--output '{output}' cannot be written: {error}") from error
     return markdown
+
+
+def _check_output(output: Path, results: Results, runs: Sequence[Path]) -> None:
+    """Refuse a folder of other things, and a report with rows that no run holds any more: it may be all that is left.
+
+    Args:
+        output: folder to write, there or not.
+        results: of the runs, those of all policies.
+        runs: folders of runs or reports.
+    """
+    try:
+        if not output.is_dir() or not any(output.iterdir()):
+            return
+    except OSError as error:
+        raise UserError(f"--output '{output}' cannot be written: {error}") from error
+    if not all((output / name).is_file() for name in (SETTING, RECORDS)):
+        raise UserError(f"--output '{output}' holds other things than a report: choose a new or empty folder.")
+    kept = {tuple(row.as_text()) for row in results.rows}
+    for row in Results.read([output])[0].rows:
+        if tuple(row.as_text()) not in kept:
+            raise UserError(
+                f"--output '{output}' holds results of {row.cell} that are not in {', '.join(map(str, runs))}: choose "
+                "another --output."
+            )
 
 
 def _page(results: Results, tables: Sequence[str], figures: Sequence[Path]) -> str:

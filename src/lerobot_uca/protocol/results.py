@@ -1,6 +1,7 @@
 """Results of one or several runs, by cell, as the tables and figures need them."""
 
 import json
+import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -10,12 +11,14 @@ import numpy as np
 
 from lerobot_uca.errors import UserError
 from lerobot_uca.protocol.cells import POLICIES, Cell
-from lerobot_uca.protocol.folder import RunFolder, first_difference, write_json
+from lerobot_uca.protocol.folder import RECORDS, SETTING, RunFolder, first_difference, write_json
 from lerobot_uca.protocol.intervals import Estimate, Successes, mean_difference, mean_rate, wilson
 from lerobot_uca.protocol.rows import CorruptRow, Row, write_rows
 from lerobot_uca.protocol.setting import FIRST_TUNING_SEED, Setting
 
 N_BEST = 5
+_WRITTEN = re.compile(rf"episodes(_({'|'.join(POLICIES)})_\d+)?\.csv")
+"""The names that `Results.write` has given to files of rows; of earlier versions a single one."""
 
 
 class Spread(NamedTuple):
@@ -94,15 +97,16 @@ class Results:
 
     def write(self, folder: Path) -> None:
         """Write all of it into a folder that `read` reads, in place of other results there."""
-        write_json(folder / "setting.json", self.setting.as_values())
+        write_json(folder / SETTING, self.setting.as_values())
         by_file: dict[Path, list[Row]] = defaultdict(list)  # of up to 0.6 MB, 37 tasks each
         for row in self.rows:
             by_file[folder / f"episodes_{row.policy}_{row.seed}.csv"].append(row)
         for path, rows in by_file.items():
             write_rows(path, rows)
         for path in {*folder.glob("episodes*.csv")} - {*by_file}:
-            path.unlink()
-        write_json(folder / "cells.json", {"cells": [self.records[cell] for cell in sorted(self.records)]})
+            if _WRITTEN.fullmatch(path.name):
+                path.unlink()
+        write_json(folder / RECORDS, {"cells": [self.records[cell] for cell in sorted(self.records)]})
 
     def seeds(self, task: str, policy: str) -> list[int]:
         """Training seeds whose last checkpoint is evaluated."""

@@ -85,7 +85,11 @@ def read_rows(path: Path) -> Iterator[Row | CorruptRow]:
     """The rows of a CSV file and, in their places, its lines that are not rows."""
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         reader = csv.DictReader(file)
-        missing = [name for name in Row._fields if name not in (reader.fieldnames or ())]
+        try:
+            missing = [name for name in Row._fields if name not in (reader.fieldnames or ())]
+        except csv.Error as error:  # a line too long to be one
+            yield CorruptRow(path, 1, str(error))
+            return
         if missing:
             yield CorruptRow(path, 1, f"the header lacks {', '.join(missing)}")
             return

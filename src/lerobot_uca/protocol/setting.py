@@ -43,10 +43,15 @@ class _Rule(NamedTuple):
     words: str
 
 
+def _is_number(value: Any) -> bool:
+    """Python calls truth a whole number, too."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 _DEMONSTRATOR_RULES = {
     "smoothing": _Rule(
         SUITES["all"],
-        lambda value: isinstance(value, int | float) and 0 < value <= 1,
+        lambda value: _is_number(value) and 0 < value <= 1,
         "numbers above 0 and up to 1 by 'benchmark/task'",
     ),
     "straight_paths": _Rule(
@@ -54,7 +59,7 @@ _DEMONSTRATOR_RULES = {
     ),
     "pushes": _Rule(
         ("metaworld",),
-        lambda value: isinstance(value, int | float) and 0 <= value < 1,
+        lambda value: _is_number(value) and 0 <= value < 1,
         "a number from 0 and below 1 by benchmark, metaworld alone",
     ),
     "successful_steps": _Rule(
@@ -152,14 +157,25 @@ class Setting:
                 raise UserError(f"Setting '{self.name}': {name} must be a whole number above 0, got {value!r}.")
         self._check_lengths()
         self._check_demonstrators()
+        self._check_options()
+
+    def _check_options(self) -> None:
         types = sorted({method.type for method in POLICIES.values()})
+        options = {"policy": self.policy}
         for field_name, what, valid in (("benchmarks", "benchmark", list(ENVIRONMENTS)), ("policies", "type", types)):
-            for name in getattr(self, field_name):
+            for name, further in getattr(self, field_name).items():
                 if name not in valid:
                     raise UserError(
                         f"Setting '{self.name}': {field_name} holds options by {what} ({', '.join(valid)}), "
                         f"got '{name}'."
                     )
+                options[f"{field_name}.{name}"] = further
+        for name, values in options.items():
+            if "type" in values:
+                raise UserError(
+                    f"Setting '{self.name}': {name} may hold any option but type, which --policies names, got "
+                    f"{values['type']!r}."
+                )
 
     def _check_lengths(self) -> None:
         for key, (steps, evaluations) in ((key, astuple(length)) for key, length in self.lengths.items()):

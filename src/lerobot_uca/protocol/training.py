@@ -157,14 +157,15 @@ def run(program: str, arguments: list[str], *, log: Path, keep: TextIOWrapper | 
         NoSpaceError: if it fails for want of space.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "lerobot_uca.protocol.tied", str(Path(sys.executable).with_name(program))]
+    # -P: of the working directory nothing is imported
+    tie = [sys.executable, "-P", "-m", "lerobot_uca.protocol.tied"]
     with open_log(log) as file:
         file.write(f"$ {program} {' '.join(arguments)}\n")
         file.flush()
         start = file.tell()
         keep_open = () if keep is None else (keep.fileno(),)
         result = subprocess.run(  # noqa: S603
-            [*command, *arguments],
+            [*tie, str(Path(sys.executable).with_name(program)), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=file,

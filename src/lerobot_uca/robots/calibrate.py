@@ -6,6 +6,7 @@ Example:
 
 import csv
 import logging
+import shutil
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -143,8 +144,7 @@ def see_board(folder: Path, board: BoardConfig, camera: Camera) -> tuple[Array, 
     file = folder / "poses.csv"
     rows = _read_csv(file)
     poses = _columns(file, rows, POSE)
-    if "image" not in rows[0]:
-        raise UserError(f"'{file}' must have the column image, the names of the pictures, got {', '.join(rows[0])}.")
+    names = _names(file, rows)
     if not (board.dictionary.startswith("DICT_") and hasattr(cv2.aruco, board.dictionary)):
         raise UserError(f"board.dictionary must be one of OpenCV's, such as DICT_4X4_50, got '{board.dictionary}'.")
     if not (0 < board.marker < board.square and min(board.squares) >= MIN_SQUARES):
@@ -157,34 +157,46 @@ def see_board(folder: Path, board: BoardConfig, camera: Camera) -> tuple[Array, 
     detector = cv2.aruco.CharucoDetector(charuco)
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     seen, unseen = [], []
-    for row, pose in zip(tqdm(rows, desc="Pictures", unit="picture", disable=None), poses, strict=True):
-        picture = cv2.imread(str(folder / row["image"]), cv2.IMREAD_GRAYSCALE)
+    for name, pose in zip(tqdm(names, desc="Pictures", unit="picture", disable=None), poses, strict=True):
+        picture = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE)
         if picture is None or picture.shape != (camera.height, camera.width):
             got = "no picture" if picture is None else f"{picture.shape[1]} x {picture.shape[0]}"
-            raise UserError(f"'{folder / row['image']}' must be {camera.width} x {camera.height} pixels, got {got}.")
+            raise UserError(f"'{folder / name}' must be {camera.width} x {camera.height} pixels, got {got}.")
         X_camera_board = _board_pose(detector, charuco, picture, K)
         if X_camera_board is None:
-            unseen.append(row["image"])
+            unseen.append(name)
         else:
             seen.append((_from_vectors(pose[3:], pose[:3]), X_camera_board))
     if unseen:
-        logger.warning("%d of %d pictures show too little of the board: %s.", len(unseen), len(rows), ", ".join(unseen))
+        logger.warning(
+            "%d of %d pictures show too little of the board: %s.", len(unseen), len(names), ", ".join(unseen)
+        )
     X_base_tool, X_camera_boards = ([pair[side] for pair in seen] for side in (0, 1))
     return np.array(X_base_tool).reshape(-1, 4, 4), np.array(X_camera_boards).reshape(-1, 4, 4)
+
+
+def _names(file: Path, rows: list[dict[str, str]]) -> list[str]:
+    if "image" not in rows[0]:
+        raise UserError(f"'{file}' must have the column image, the names of the pictures, got {', '.join(rows[0])}.")
+    for index, row in enumerate(rows, start=1):
+        if not row["image"]:  # None in a row that is too short
+            raise UserError(f"'{file}' must have the name of a picture in each row, got none in row {index}.")
+    return [row["image"] for row in rows]
 
 
 def _board_pose(detector: Any, board: Any, picture: Any, K: Array) -> Array | None:
     import cv2
 
     corners, ids, _, _ = detector.detectBoard(picture)
-    if ids is None or len(ids) < MIN_CORNERS:
+    if ids is None or len(ids) < MIN_CORNERS or board.checkCharucoCornersCollinear(ids):
         return None
     on_board, in_picture = board.matchImagePoints(corners, ids)
     found, rotation, translation = cv2.solvePnP(on_board, in_picture, K, np.zeros(5), flags=cv2.SOLVEPNP_IPPE)
     if not found:
         return None
     rotation, translation = cv2.solvePnPRefineLM(on_board, in_picture, K, np.zeros(5), rotation, translation)
-    return _from_vectors(np.asarray(rotation, np.float64), np.asarray(translation, np.float64))
+    X = _from_vectors(np.asarray(rotation, np.float64), np.asarray(translation, np.float64))
+    return X if np.isfinite(X).all() else None
 
 
 def _from_vectors(rotation: Array, translation: Array) -> Array:
@@ -199,7 +211,7 @@ def _read_csv(file: Path) -> list[dict[str, str]]:
     try:
         with file.open(newline="", encoding="utf-8-sig") as opened:  # spreadsheets write a mark at the beginning
             return [{(key or "").strip(): value for key, value in row.items()} for row in csv.DictReader(opened)]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"'{file}' cannot be read: {error}") from error
 
 
@@ -229,9 +241,10 @@ def run(config: CalibrateConfig) -> None:
     pose = calibration.camera.X_world_camera
     before = _previous(config)
     try:
+        replaced = _copy_replaced(config)
         file = calibration.write(config.folder)
-        if before is not None and before.serial != config.serial:
-            _set_aside(config.folder, before)
+        for former in replaced - {file}:
+            former.unlink()
     except OSError as error:
         raise UserError(f"--folder '{config.folder}' cannot be written: {error}") from error
     worst = int(np.argmax(fit.mm))
@@ -244,15 +257,22 @@ def run(config: CalibrateConfig) -> None:
     print(f"Written: {file}. Use it: export LEROBOT_UCA_CALIBRATION={config.folder.absolute()}")
 
 
-def _set_aside(folder: Path, replaced: Calibration) -> None:
-    """A camera's name stands for one device: the file of the one before is no calibration any longer."""
-    for file in folder.glob("[!.]*.yaml"):
+def _copy_replaced(config: CalibrateConfig) -> set[Path]:
+    """Copy to .old what stands for this camera's name, this device or its file, and is no calibration any longer.
+
+    A name stands for one device, and a device has one name and one file.
+    """
+    new = (config.camera, config.serial, f"{config.serial}.yaml")
+    replaced = set()
+    for file in config.folder.glob("[!.]*.yaml"):
         values = yaml.safe_load(file.read_text(encoding="utf-8"))
-        if (str(values["serial"]), str(values["camera"])) == (replaced.serial, replaced.camera.name):
-            aside = file.rename(file.with_name(f"{file.name}.old"))
-            logger.warning(
-                "Camera '%s' was the device %s: its file is %s now.", replaced.camera.name, replaced.serial, aside
-            )
+        camera, serial = str(values["camera"]), str(values["serial"])
+        is_shared = [ours == theirs for ours, theirs in zip(new, (camera, serial, file.name), strict=True)]
+        if any(is_shared) and not all(is_shared):  # all: the same camera, calibrated anew
+            aside = shutil.copy2(file, file.with_name(f"{file.name}.old"))
+            logger.warning("Camera '%s' was the device %s: its file is %s now.", camera, serial, aside)
+            replaced.add(file)
+    return replaced
 
 
 def _previous(config: CalibrateConfig) -> Calibration | None:

@@ -38,15 +38,14 @@ def connect(name: str, camera: Any) -> None:
     """Connect a LeRobot camera.
 
     Raises:
-        UserError: if it fails, and an L515 is plugged in, which the installed librealsense does not know.
+        UserError: if it fails; it says so where an L515 is plugged in, which the installed librealsense does not know.
     """
     try:
         camera.connect()
     except (OSError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         hint = dropped_camera(USB_DEVICES)
-        if hint is None:
-            raise
-        raise UserError(f"Camera '{name}' cannot be opened. {hint}") from error
+        raise UserError(f"Camera '{name}' cannot be opened: {reason}.{f' {hint}' if hint else ''}") from error
 
 
 def dropped_camera(devices: Path) -> str | None:

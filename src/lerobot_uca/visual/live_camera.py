@@ -7,7 +7,7 @@ import numpy as np
 from lerobot.cameras import CameraConfig, make_cameras_from_configs
 from numpy.typing import NDArray
 
-from lerobot_uca.errors import UserError
+from lerobot_uca.errors import UserError, reported
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import DepthError, DepthToCloud
 from lerobot_uca.point_clouds.geometry import Crop
@@ -37,7 +37,8 @@ def live_clouds(
         make = DepthToCloud([calibration_of(name, installed_calibrations(calibration)).view()], crop, n_points)
     except CalibrationError as error:
         raise UserError(str(error)) from error
-    camera: Any = make_cameras_from_configs({name: config})[name]
+    with reported(f"Camera '{name}' cannot be opened"):  # a RealSense is looked for by its name here
+        camera: Any = make_cameras_from_configs({name: config})[name]
     connect(name, camera)
     try:
         check_cameras({name: camera})

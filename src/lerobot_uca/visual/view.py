@@ -196,7 +196,7 @@ def view(config: ViewConfig) -> Generator[CropPage]:
     with closing(clouds_of(config)) as seen:
         if config.output is None and config.rrd is None:
             yield from pages_of(config, seen)
-        clouds = list(seen if config.camera is None else islice(seen, 1))
+        clouds = list(islice(seen, 1) if config.rrd is None else seen)  # a picture is of the first frame
     crop = crop_of(config, clouds[0])
     if config.output is not None:
         draw(config.output, clouds[0], crop)

@@ -580,7 +580,7 @@ BAD_ACTIONS = {
     "nan": ({JOINT_KEYS[1]: math.nan}, "finite numbers, got others for shoulder_lift.pos"),
     "infinite": ({GRIPPER_KEY: math.inf}, "got others for gripper.pos"),
     "degrees": ({JOINT_KEYS[0]: 90.0}, "radians.*got 90.0. Degrees?"),
-    "percent": ({GRIPPER_KEY: 60.0}, r"in 0 .open. to 1 .closed., got 60. Another scale?"),
+    "percent": ({GRIPPER_KEY: 3.0}, r"in 0 .open. to 1 .closed., got 3. Another scale?"),
     "nothing": ({JOINT_KEYS[0]: None}, "values are numbers, one for each name"),
     "two numbers": ({JOINT_KEYS[0]: np.zeros(2)}, "values are numbers, one for each name"),
     "another robot": ({"elbow_flex.pos": 0.0}, "unknown: elbow_flex.pos"),

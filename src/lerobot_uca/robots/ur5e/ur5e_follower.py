@@ -48,7 +48,10 @@ STOP_COMES_EARLY = 0.05  # [s], for the way that messages take
 
 MEANT_IN_RADIANS = 2 * math.pi + 1.0
 MEANT_IN_METRES = 2.0  # the arm reaches 0.85 m
-GRIPPER_RANGE = (-10.0, 10.0)  # a policy that has hardly been trained may leave 0 to 1; percents go farther
+GRIPPER_RANGE = (-1.5, 2.5)
+"""A policy that has hardly been trained gives noise: this is four of its standard deviations around the middle of a
+gripper's 0 to 1 (MIN_MAX normalised). Percents go farther."""
+
 STANDS = 1e-2  # [rad/s], and no more
 ARRIVED = 3e-3  # [rad], between the first target and where the arm is measured
 SETTLING = 0.4  # [s], after which an arm whose setpoint is at the first target is as near as it gets
