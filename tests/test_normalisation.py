@@ -159,6 +159,18 @@ def test_held_out_episodes_do_not_count(dataset_root, tmp_path):
     np.testing.assert_allclose(stats[f"{STATE}.max"], columns(dataset_root, STATE, [0]).max(axis=0), rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("spoiled", "hint"), [([4], r"--dataset\.episodes=\[0,1,2,3\] "), (range(5), "No episode is left")]
+)
+def test_the_hint_is_about_all_episodes_held_out_or_not(tmp_path, spoiled, hint):
+    def spoil(frame, episode, index):
+        frame[ACTION][0] = np.nan if episode in spoiled else frame[ACTION][0]
+
+    write_dataset(tmp_path / "data", n_episodes=5, features=features(OBS_POINT_CLOUD), change=spoil)
+    with pytest.raises(UserError, match=hint):
+        train(tmp_path / "data", tmp_path / "new", dataset={"eval_split": 0.0 if len(spoiled) > 1 else 0.4})
+
+
 @pytest.mark.parametrize("pictures", [False, True])  # with some, LeRobot reads row by row
 def test_leaving_out_the_episode_with_a_nan_trains(tmp_path, pictures):
     def spoil(frame, episode, index):

@@ -9,7 +9,7 @@ import select
 import signal
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
@@ -144,16 +144,20 @@ def n_cores() -> int:
 
 
 @contextmanager
-def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
+def worker_pool(n_workers: int, begin: Callable[[], None] | None = None) -> Iterator[ProcessPoolExecutor]:
     """A pool of worker processes. When it is left, what they are doing is finished, and what waits is dropped.
 
     They end with this process, however that ends.
+
+    Args:
+        n_workers: how many.
+        begin: what each does first.
 
     Raises:
         UserError: if one of them was ended from outside.
     """
     context = multiprocessing.get_context("forkserver")
-    pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=_begin_worker)
+    pool = ProcessPoolExecutor(n_workers, mp_context=context, initializer=_begin_worker, initargs=(begin,))
     try:
         with signals_put_off():
             for _ in range(n_workers):
@@ -165,10 +169,12 @@ def worker_pool(n_workers: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _begin_worker() -> None:
+def _begin_worker(begin: Callable[[], None] | None) -> None:
     """End with the parent, and leave to it what LeRobot says of missing video decoders: a page in each process."""
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
     _end_with_parent()
+    if begin is not None:
+        begin()
 
 
 def _end_with_parent() -> None:

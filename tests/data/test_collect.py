@@ -85,6 +85,11 @@ def test_a_demonstration_cannot_end_before_it_is_one(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+def test_a_demonstration_cannot_end_before_its_success_is_decided(tmp_path):
+    with pytest.raises(UserError, match=r"when env\.success=final is not decided yet: add --env\.success=any\."):
+        collect(config(tmp_path / "new", env=AdroitPointCloudConfig(task="door"), successful_steps=10))
+
+
 def test_a_demonstration_can_go_straight(collected, tmp_path):
     collect(config(tmp_path / "drawer", straight_paths=True))
     straight, bent = (

@@ -6,6 +6,7 @@ import re
 import sys
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,11 +28,13 @@ from lerobot_uca.data import convert as command
 from lerobot_uca.data import edit_dataset
 from lerobot_uca.data.batched_dataset import BatchedDataset
 from lerobot_uca.data.convert import ConvertConfig, convert, convert_episode
+from lerobot_uca.data.recorded_calibrations import recorded_calibrations
 from lerobot_uca.data.sources.find import find_source
 from lerobot_uca.data.sources.lerobot_source import LOST_RECIPE
 from lerobot_uca.data.sources.source import Frame
 from lerobot_uca.errors import UserError
 from lerobot_uca.features import OBS_POINT_CLOUD
+from lerobot_uca.point_clouds.geometry import Crop, as_pose
 from lerobot_uca.point_clouds.recipe import CALIBRATION_VARIABLE, RECIPE_INFO, CloudRecipe
 
 
@@ -108,7 +111,7 @@ def test_video_is_converted_too(tmp_path):
 # Data made elsewhere ------------------------------------------------------------------------------------------------
 
 
-def write_zarr(path, *, channels=6, lengths=(5, 7), without=()):
+def write_zarr(path, *, channels=6, lengths=(5, 7), without=(), fill=0):
     """Write demonstrations in DP3's layout."""
     zarr = pytest.importorskip("zarr")
     rng = np.random.default_rng(0)
@@ -120,6 +123,7 @@ def write_zarr(path, *, channels=6, lengths=(5, 7), without=()):
         "data/img": np.zeros((n_steps, 4, 4, 3)),
         "meta/episode_ends": np.cumsum(lengths),
     }
+    arrays["data/point_cloud"][:, 600 - fill :] = 0
     group = zarr.open_group(str(path), mode="w", zarr_format=2)
     for key, values in arrays.items():
         if key not in without:
@@ -203,7 +207,9 @@ def test_the_layout_of_lerobots_open_pull_request(tmp_path, colours, caplog):
     assert dataset.num_frames == source.num_frames
     theirs = source[3]["observation.pointcloud"].numpy()[:, :3]
     assert set(map(tuple, dataset[3][OBS_POINT_CLOUD].numpy())) <= set(map(tuple, theirs))
-    assert "Not kept: observation.intrinsics.front, observation.extrinsics.front." in caplog.messages
+    left_out = ["observation.intrinsics.front", "observation.extrinsics.front"]
+    left_out += ["colours of observation.pointcloud"] if colours else []
+    assert f"Not kept: {', '.join(left_out)}." in caplog.messages
 
 
 def write_with_calibration(
@@ -236,6 +242,15 @@ def test_a_calibration_beside_the_depth_is_used(tmp_path, monkeypatch, caplog):
         np.testing.assert_allclose(
             dataset[index][OBS_POINT_CLOUD], make_recipe().make()([live_frame(index)]), atol=1e-5
         )
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 1), (1, 48, 64)])
+def test_a_calibration_is_of_the_images_size_wherever_their_channel_is(tmp_path, shape):
+    dataset = write_with_calibration(tmp_path / "source")
+    assert dataset.features[DEPTH_KEY]["shape"] == (48, 64, 1)
+    dataset.features[DEPTH_KEY]["shape"] = shape
+    camera = recorded_calibrations(dataset)["front"].camera
+    assert (camera.height, camera.width) == (48, 64)
 
 
 def test_episodes_in_which_the_camera_stood_elsewhere_can_be_left_out(tmp_path, monkeypatch):
@@ -316,6 +331,18 @@ def test_a_folder_of_files(tmp_path, kind):
         np.testing.assert_allclose(frame["action"], row[6:], atol=1e-6)
         assert frame["task"] == row[2]
         assert set(map(tuple, frame[OBS_POINT_CLOUD].numpy())) <= set(map(tuple, cloud))
+
+
+def test_what_a_folder_holds_besides_is_said(tmp_path, caplog):
+    (tmp_path / "recorded").mkdir()
+    for index in range(2):
+        np.savez(tmp_path / "recorded" / f"{index}.npz", points=np.full((40, 6), 0.1 + index))
+    (tmp_path / "recorded" / "frames.csv").write_text(
+        "file,episode,state_x,action_x,reward\n0.npz,0,1,2,3\n1.npz,0,1,2,3\n"
+    )
+    convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, crop_low=None, crop_high=None))
+    assert "Not kept: column reward, the points' colours." in caplog.messages
+    assert "No task is given: --task says in a sentence what the robot does." in caplog.messages
 
 
 def test_an_episode_of_one_frame_is_named(tmp_path):
@@ -435,6 +462,32 @@ def test_two_conversions_can_be_merged(depth_dataset, tmp_path, monkeypatch):
     assert LeRobotDataset("test/both", root=tmp_path / "both").num_episodes == 2
 
 
+def test_days_between_which_the_camera_was_calibrated_anew_can_be_merged(depth_dataset, tmp_path, calibrated, caplog):
+    roots = [tmp_path / "monday", tmp_path / "tuesday"]
+    for root, x in zip(roots, (0.0, 0.003), strict=True):
+        camera = make_camera()
+        pose = np.array(camera.X_world_camera)
+        pose[0, 3] += x
+        replace(make_calibration(), camera=replace(camera, X_world_camera=as_pose(pose))).write(calibrated)
+        convert(config(depth_dataset.root, root))
+    metadata = [LeRobotDataset("test/clouds", root=root).meta for root in roots]
+    edit_dataset._unite_recipes(metadata)
+    assert metadata[0].features == metadata[1].features
+    assert RECIPE_INFO in metadata[0].features[OBS_POINT_CLOUD]["info"]
+    assert f"In '{roots[1]}' camera 'front' is 3.0 mm and 0.00 deg from where it was." in caplog.text
+
+
+def test_collected_clouds_of_two_crops_lose_their_recipe_when_merged(tmp_path, caplog):
+    """Several tasks that are collected together have none either."""
+    recipes = [make_recipe(), replace(make_recipe(), crop=Crop((0, 0, 0), (1, 1, 1)))]
+    metadata = [write_dataset(tmp_path / str(index)).meta for index in range(2)]
+    for meta, recipe in zip(metadata, recipes, strict=True):
+        meta.features[OBS_POINT_CLOUD]["info"] = {RECIPE_INFO: recipe.as_dict()}
+    edit_dataset._unite_recipes(metadata)
+    assert [meta.features[OBS_POINT_CLOUD]["info"] for meta in metadata] == [{}, {}]
+    assert "Not kept: the recipe of the clouds" in caplog.text
+
+
 @pytest.mark.parametrize("damage", ["info", "rows", "no rows"])
 def test_a_damaged_dataset_is_one_line(tmp_path, damage):
     write_dataset(tmp_path / "data")
@@ -520,6 +573,8 @@ def test_wrong_sources(tmp_path, depth_dataset, monkeypatch):
     write_zarr(tmp_path / "a.zarr", without=("data/state",))
     write_zarr(tmp_path / "ends.zarr", lengths=(5, 7), without=("meta/episode_ends",))
     (tmp_path / "empty.zarr").mkdir()
+    group = pytest.importorskip("zarr").open_group(str(tmp_path / "group.zarr"), mode="w")
+    group.create_group("data/state")
     write_folder(tmp_path / "recorded", "npz")
     (tmp_path / "columns").mkdir()
     (tmp_path / "columns" / "frames.csv").write_text("file,episode\na,0\n")
@@ -529,6 +584,7 @@ def test_wrong_sources(tmp_path, depth_dataset, monkeypatch):
         "must be a LeRobot dataset": config(tmp_path / "nothing", tmp_path / "out"),
         "data/state is missing, got data/action, data/img": config(tmp_path / "a.zarr", tmp_path / "out", fps=5),
         "meta/episode_ends is missing": config(tmp_path / "ends.zarr", tmp_path / "out", fps=5),
+        "data/point_cloud, data/state, data/action": config(tmp_path / "group.zarr", tmp_path / "out", fps=5),
         "cannot be read as zarr": config(tmp_path / "empty.zarr", tmp_path / "out", fps=5),
         "must have the columns file, episode, state_": config(tmp_path / "columns", tmp_path / "out", fps=5),
         "a.npz' .frames.csv. cannot be read": config(tmp_path / "files", tmp_path / "out", fps=5),
@@ -663,6 +719,34 @@ def test_clouds_beside_the_depth_are_not_kept(tmp_path, caplog):
     assert f"Not kept: {OBS_POINT_CLOUD}." in caplog.messages
 
 
+def test_clouds_beside_the_depth_are_taken_when_asked_for(tmp_path, monkeypatch, caplog):
+    monkeypatch.delenv(CALIBRATION_VARIABLE, raising=False)
+    columns = {OBS_POINT_CLOUD: lambda index: np.full((16, 3), 0.1 + index, np.float32)}
+    source = write_depth_dataset(tmp_path / "data", video=False, columns=columns)
+    with pytest.raises(UserError, match=r"The depth makes no clouds: .*needs a calibration.*--use_clouds=true takes"):
+        convert(config(source.root, tmp_path / "clouds"))
+    whole = {"crop_low": None, "crop_high": None, "n_points": 16, "calibration": str(tmp_path)}
+    dataset = convert(config(source.root, tmp_path / "clouds", use_clouds=True, **whole))
+    np.testing.assert_allclose(dataset[3][OBS_POINT_CLOUD], 3.1)
+    assert "--calibration is for depth; these clouds are taken as they are." in caplog.messages
+
+
+def test_missing_points_written_as_zeros_are_no_points(tmp_path, caplog):
+    """As the baselines' Adroit fills up its clouds, and cameras write pixels without depth."""
+    arrays = write_zarr(tmp_path / "a.zarr", fill=100)
+    assert (arrays["data/point_cloud"][:, -100:, :3] == 0).all()
+    whole = {"crop_low": None, "crop_high": None, "n_points": 510}
+    dataset = convert(config(tmp_path / "a.zarr", tmp_path / "clouds", fps=10, **whole))
+    assert np.abs(dataset[0][OBS_POINT_CLOUD].numpy()).max(axis=1).min() > 0
+    assert "1200 points at (0, 0, 0), which stand for missing ones, were left out." in caplog.messages
+
+
+def test_points_are_not_repeated_to_make_more(tmp_path):
+    write_zarr(tmp_path / "a.zarr")
+    with pytest.raises(UserError, match=r"--n_points must be at most 600, the points of .* clouds, got 601\."):
+        convert(config(tmp_path / "a.zarr", tmp_path / "clouds", fps=10, n_points=601))
+
+
 @pytest.mark.parametrize(
     ("root", "message"),
     [("data/raw", r"would replace the source, '.*data/raw': name another folder"), ("data", "holds other things, raw")],
@@ -685,7 +769,7 @@ def test_no_more_is_held_than_needed():
                 assert sum(each() is not None for each in alive) <= 1  # the one before, in the caller's hands
                 points = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
                 alive.append(weakref.ref(points))
-                frame = Frame(points, 1000, 0.0, np.zeros(2, np.float32), np.zeros(2, np.float32), "a")
+                frame = Frame(points, 1000, 0.0, 0, np.zeros(2, np.float32), np.zeros(2, np.float32), "a")
                 del points
                 yield frame
                 del frame

@@ -94,6 +94,12 @@ def test_other_files_are_refused(tmp_path, text):
         read_calibrations(tmp_path)
 
 
+def test_what_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "old.yaml").mkdir()
+    with pytest.raises(CalibrationError, match=r"old\.yaml' must be a YAML file: .*Is a directory"):
+        read_calibrations(tmp_path)
+
+
 def test_a_folder_holds_one_calibration_a_camera(tmp_path):
     with pytest.raises(CalibrationError, match=r"must be a folder of calibrations \(\*.yaml\), made by"):
         read_calibrations(tmp_path / "missing")

@@ -1,12 +1,17 @@
 """Compiled rays against MuJoCo's own, ray by ray, on random scenes."""
 
+import os
+import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import lerobot_uca
 from lerobot_uca import point_clouds
 from lerobot_uca.point_clouds import ray_casting, single_rays
 from lerobot_uca.point_clouds.geometry import Camera, ray_sphere_distances
@@ -170,3 +175,28 @@ def test_without_numba_mujoco_casts_the_same(monkeypatch, caplog):
     monkeypatch.undo()
     ray_casting._caster.cache_clear()
     assert_equal(RayCaster(CAMERA, with_normals=True).cast(model, data), slow)
+
+
+def test_what_is_compiled_follows_every_module(tmp_path):
+    """Numba's own cache looks at a function's own file alone."""
+    package = Path(lerobot_uca.__file__).parent
+    shutil.copytree(package, tmp_path / "lerobot_uca", ignore=shutil.ignore_patterns("__pycache__"))
+    script = """if True:
+        import mujoco, numpy as np
+        from lerobot_uca.point_clouds.geometry import Camera
+        from lerobot_uca.point_clouds.ray_casting import RayCaster
+        xml = '<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1"/></worldbody></mujoco>'
+        model = mujoco.MjModel.from_xml_string(xml)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        print(RayCaster(Camera.from_fovy("c", (0, 0, 1), np.eye(3), 45, (3, 3))).cast(model, data).distance[4])
+    """
+
+    def distance():
+        env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        return float(subprocess.check_output([sys.executable, "-c", script], env=env))
+
+    assert distance() == pytest.approx(0.9)
+    neighbour = tmp_path / "lerobot_uca" / "point_clouds" / "intersections.py"
+    neighbour.write_text(neighbour.read_text().replace("t = (side * size[axis]", "t = 0.5 + (side * size[axis]"))
+    assert distance() == pytest.approx(1.4)

@@ -4,7 +4,7 @@
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,17 +50,23 @@ def chosen_statistics(dataset: Any, masks: Masks) -> Statistics:
     return {key: stats[key] for key in masks if key in stats}
 
 
-def check_finite(dataset: Any, masks: Masks) -> None:
-    """Raise a `UserError` that names episode and frame if a value of the chosen episodes is NaN or infinite.
+def check_finite(dataset: Any, masks: Masks, wanted: Sequence[int] | None = None) -> None:
+    """Raise a `UserError` that names episode and frame if a value of the dataset's episodes is NaN or infinite.
 
     A cloud without valid points is refused, too. A feature without a mask of a dataset that is not read in batches, and
     all of one that is streamed, is checked by its statistics, and its rows only to name the frame.
+
+    Args:
+        dataset: of the episodes to train on, or of those held out.
+        masks: see above.
+        wanted: the episodes that the user has asked for, of which both are parts; None for all.
     """
+    asked_for = range(dataset.meta.total_episodes) if wanted is None else wanted
     for key, mask in masks.items():
         if _is_streamed(dataset) or (mask is None and _columns(dataset) is None):
-            _check_statistics(dataset, key)
+            _check_statistics(dataset, key, asked_for)
         else:
-            _check_rows(dataset, key, mask)
+            _check_rows(dataset, key, mask, asked_for)
 
 
 def _is_streamed(dataset: Any) -> bool:
@@ -90,7 +96,7 @@ def _rows(dataset: Any, key: str, mask: str | None) -> Iterator[_Rows]:
         yield _Rows(values, valid.flatten(1).bool(), list(zip(episodes, frames, strict=True)))
 
 
-def _check_rows(dataset: Any, key: str, mask: str | None) -> None:
+def _check_rows(dataset: Any, key: str, mask: str | None, wanted: Sequence[int]) -> None:
     empty: list[tuple[int, int]] = []
     bad: list[tuple[int, int]] = []
     n_bad = 0  # values of the first of these rows
@@ -101,22 +107,22 @@ def _check_rows(dataset: Any, key: str, mask: str | None) -> None:
         n_bad = n_bad if bad or not found else int(is_bad[found[0]].sum())
         bad += [rows.places[row] for row in found]
     if empty:
-        raise UserError(f"'{mask}' must call some points of '{key}' valid, got none in {_place(empty, dataset)}")
+        raise UserError(f"'{mask}' must call some points of '{key}' valid, got none in {_place(empty, wanted)}")
     if bad:
         n_values = int(np.prod(rows.values.shape[1:]))
         raise UserError(
-            f"'{key}' must be finite, got {n_bad} of {n_values} values NaN or infinite in {_place(bad, dataset)}"
+            f"'{key}' must be finite, got {n_bad} of {n_values} values NaN or infinite in {_place(bad, wanted)}"
         )
 
 
-def _check_statistics(dataset: Any, key: str) -> None:
+def _check_statistics(dataset: Any, key: str, wanted: Sequence[int]) -> None:
     for episode, stats in _episode_statistics(dataset, {key: None}).items():
         if not all(np.isfinite(each).all() for of_key in stats.values() for each in of_key.values()):
             frame = _first_bad_frame(dataset, key, episode)
             place = "or its statistics" if frame is None else f"frame {frame}"
             raise UserError(
                 f"'{key}' must be finite, got NaN or infinite values in episode {episode}, {place}. "
-                + _without([episode], dataset)
+                + _without([episode], wanted)
             )
 
 
@@ -133,16 +139,17 @@ def _bad(values: Tensor, valid: Tensor) -> Tensor:
     return (bad & valid[..., None]).flatten(1)
 
 
-def _place(places: list[tuple[int, int]], dataset: Any) -> str:
+def _place(places: list[tuple[int, int]], wanted: Sequence[int]) -> str:
     episodes = sorted({episode for episode, _ in places})
     more = f" and in {len(places) - 1} more frames, of the episodes {episodes[:MAX_LISTED]}" if len(places) > 1 else ""
-    return f"episode {places[0][0]}, frame {places[0][1]}{more}. {_without(episodes, dataset)}"
+    return f"episode {places[0][0]}, frame {places[0][1]}{more}. {_without(episodes, wanted)}"
 
 
-def _without(episodes: list[int], dataset: Any) -> str:
-    """A sentence that says how to train without some episodes."""
-    chosen = range(dataset.meta.total_episodes) if dataset.episodes is None else dataset.episodes
-    others = [episode for episode in chosen if episode not in set(episodes)]
+def _without(episodes: list[int], wanted: Sequence[int]) -> str:
+    """A sentence that says how to train without some of the episodes that were asked for."""
+    others = [episode for episode in wanted if episode not in set(episodes)]
+    if not others:
+        return "No episode is left without them."
     option = str(others).replace(" ", "") if len(others) <= MAX_LISTED else "[...]"
     return f"--dataset.episodes={option} leaves these episodes out."
 

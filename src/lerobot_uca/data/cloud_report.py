@@ -17,7 +17,8 @@ class EpisodeReport(NamedTuple):
 
     episode: int
     n_points: NDArray[np.int_]  # (L,) points inside the crop, before sampling
-    invalid: NDArray[np.float64]  # (L,) share of pixels without depth, or of points that are not finite
+    invalid: NDArray[np.float64]  # (L,) share of pixels without depth, or of points that are not finite or missing
+    n_missing: int  # points at (0, 0, 0)
     low: NDArray[np.float32]  # (3,) lowest corner of the sampled clouds [m]; NaN where all are empty
     high: NDArray[np.float32]  # (3,) highest corner [m]
     state: NDArray[np.float32]  # (L, S)

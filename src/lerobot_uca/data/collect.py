@@ -124,7 +124,13 @@ def _check_successful_steps(config: CollectConfig, env_config: PointCloudEnvConf
     if config.successful_steps is None:
         return
     task = next(task for tasks in env_config.tasks().values() for task in tasks)
-    least = env_config.env_factory(task)().min_successful_steps
+    env = env_config.env_factory(task)()
+    least = env.min_successful_steps
+    if env.succeeds_at_the_end:
+        raise UserError(
+            "--successful_steps ends an episode before its time, when env.success=final is not decided yet: add "
+            "--env.success=any."
+        )
     if config.successful_steps < least:
         raise UserError(
             f"--successful_steps must be at least {least}, as many as make an episode of {env_config.type} a "

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from lerobot.configs import parser
@@ -34,7 +34,7 @@ from lerobot_uca.features import OBS_POINT_CLOUD, observation_info
 from lerobot_uca.hub import push_dataset
 from lerobot_uca.point_clouds.calibration import CalibrationError
 from lerobot_uca.point_clouds.depth import MIN_SHARE
-from lerobot_uca.point_clouds.geometry import sample_farthest
+from lerobot_uca.point_clouds.geometry import Crop, sample_farthest
 from lerobot_uca.point_clouds.recipe import RECIPE_INFO, optional_crop
 from lerobot_uca.processes import worker_pool
 
@@ -67,6 +67,8 @@ class ConvertConfig:
     colour: bool = False
     # Folder of the cameras' calibrations; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
+    # Of a dataset with both depth and clouds, take the clouds.
+    use_clouds: bool = False
     # The episodes to convert, such as [0,1,5], by their numbers in the source; by default all.
     episodes: list[int] | None = None
     # Steps a second of a source that does not know it (zarr, PLY, NPZ).
@@ -116,11 +118,15 @@ def convert(config: ConvertConfig) -> LeRobotDataset:
         raise UserError(f"--root '{root}' would replace the source, '{config.source}': name another folder.")
     if config.report is not None:
         prepare_report(config.report, root)
+    if (size := source.cloud_size) is not None and size < config.n_points:
+        raise UserError(f"--n_points must be at most {size}, the points of the source's clouds, got {config.n_points}.")
     with whole_folder(root, overwrite=config.overwrite) as unfinished:
         _write(config, source, fps, episodes, unfinished)
     if left_out := source.left_out():
         logger.warning("Not kept: %s.", ", ".join(left_out))
     dataset = LeRobotDataset(config.repo_id, root=root)
+    if "" in dataset.meta.tasks.index and not isinstance(source, LeRobotSource):
+        logger.warning("No task is given: --task says in a sentence what the robot does.")
     if config.push_to_hub:
         push_dataset(dataset, private=config.private, tags=["point-cloud"])
     return dataset
@@ -132,12 +138,23 @@ def make_source(config: ConvertConfig) -> tuple[Source, Sequence[int]]:
         crop = optional_crop(config.crop_low, config.crop_high)
         source = find_source(config.source, crop, config.task, colour=config.colour)
         episodes = source.choose(config.episodes)
-        if isinstance(source, LeRobotSource) and source.has_depth:
-            corners = (crop.low, crop.high) if crop else None
-            source.make_clouds(corners, config.n_points, config.calibration, episodes)
+        if isinstance(source, LeRobotSource) and source.has_depth and not config.use_clouds:
+            _make_clouds(config, source, crop, episodes)
+        elif config.calibration is not None:
+            logger.warning("--calibration is for depth; these clouds are taken as they are.")
     except CalibrationError as error:
         raise UserError(str(error)) from error
     return source, episodes
+
+
+def _make_clouds(config: ConvertConfig, source: LeRobotSource, crop: Crop | None, episodes: Sequence[int]) -> None:
+    corners = (crop.low, crop.high) if crop else None
+    try:
+        source.make_clouds(corners, config.n_points, config.calibration, episodes)
+    except (CalibrationError, UserError) as error:
+        if not source.has_clouds:
+            raise
+        raise UserError(f"The depth makes no clouds: {error} --use_clouds=true takes the dataset's own.") from error
 
 
 def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
@@ -156,6 +173,7 @@ def convert_episode(source: Source, n_points: int, episode: int) -> Episode:
         episode,
         n_points=np.array([frame.n_points for frame in frames]),
         invalid=np.array([frame.invalid for frame in frames]),
+        n_missing=sum(frame.n_missing for frame in frames),
         low=seen.min(axis=0),
         high=seen.max(axis=0),
         state=state,
@@ -199,6 +217,8 @@ def _write(config: ConvertConfig, source: Source, fps: int, episodes: Sequence[i
     if config.report is not None:
         write_report(config.report, reports, least)
     _warn_of_nan(reports)
+    if n_missing := sum(report.n_missing for report in reports):
+        logger.warning("%d points at (0, 0, 0), which stand for missing ones, were left out.", n_missing)
     if first_bad is not None:
         few = np.flatnonzero(first_bad.n_points < least)
         raise UserError(
@@ -216,13 +236,27 @@ def _warn_of_nan(reports: list[EpisodeReport]) -> None:
 
 
 def _converted(config: ConvertConfig, source: Source, episodes: Sequence[int]) -> Iterator[Episode]:
-    convert_one = partial(convert_episode, source, config.n_points)
     bar = partial(tqdm, total=len(episodes), desc="Converted", unit="episode")
     if config.num_workers == 0:
-        yield from bar(map(convert_one, episodes))
+        yield from bar(map(partial(convert_episode, source, config.n_points), episodes))
         return
-    with worker_pool(config.num_workers) as pool:
+    with worker_pool(config.num_workers, partial(_Worker.begin, source)) as pool:
+        convert_one = partial(_Worker.convert, config.n_points)
         yield from bar(_in_order(pool, convert_one, episodes, n_ahead=2 * config.num_workers))
+
+
+class _Worker:
+    """A worker process, which opens the source once: sent along with each episode it would be opened for each."""
+
+    source: ClassVar[Source]
+
+    @classmethod
+    def begin(cls, source: Source) -> None:
+        cls.source = source
+
+    @classmethod
+    def convert(cls, n_points: int, episode: int) -> Episode:
+        return convert_episode(cls.source, n_points, episode)
 
 
 def _in_order(
@@ -245,7 +279,7 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> None:
 
 def _features(config: ConvertConfig, source: Source, episode: Episode) -> dict[str, dict[str, Any]]:
     recipe, crop = source.recipe, source.crop
-    # LeRobot merges datasets whose features are equal: those of one crop, whatever their sources.
+    # LeRobot merges datasets whose features are equal, recipes apart: those of one crop, whatever their sources.
     info: dict[str, Any] = {
         "crop": [list(crop.low), list(crop.high)] if crop else None,
         **observation_info(source.observation),

@@ -4,6 +4,7 @@ LeRobot edits datasets as pandas tables, and Hugging Face's `datasets` (4.8) giv
 dimensions that can neither be compared nor written. LeRobot's own command loads no plugin that could mend it.
 """
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,8 +13,14 @@ import pandas as pd
 import pyarrow as pa
 from datasets.features import features as hf_features
 from datasets.features.features import PandasArrayExtensionArray, PandasArrayExtensionDtype
+from lerobot.datasets import aggregate
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_uca.errors import reported
+from lerobot_uca.features import find_point_cloud
+from lerobot_uca.point_clouds.recipe import RECIPE_INFO, CloudRecipe
+
+logger = logging.getLogger(__name__)
 
 
 def let_pandas_hold_arrays() -> None:
@@ -49,6 +56,47 @@ def _to_arrow(self: PandasArrayExtensionArray, type: pa.DataType | None = None) 
     return pa.ExtensionArray.from_storage(kind, storage.cast(kind.storage_type))
 
 
+def merge_whatever_the_recipe() -> None:
+    """LeRobot merges datasets of equal features; the recipes of their clouds may differ, if not in their crop.
+
+    A camera was calibrated anew between them, say. The merged clouds' recipe is the first dataset's, and how the others
+    differ is said. Where one has none, or another crop or other images, none is left.
+    """
+    validate = aggregate.validate_all_metadata
+
+    def validate_all_metadata(all_metadata: list[LeRobotDatasetMetadata]) -> Any:
+        _unite_recipes(all_metadata)
+        return validate(all_metadata)
+
+    aggregate.validate_all_metadata = validate_all_metadata
+
+
+def _unite_recipes(all_metadata: Sequence[LeRobotDatasetMetadata]) -> None:
+    key = find_point_cloud(all_metadata[0].features)
+    clouds = [meta.features.get(key) for meta in all_metadata]
+    if key is None or None in clouds:
+        return  # which LeRobot refuses
+    infos = [cloud.get("info") or {} for cloud in clouds]
+    others = [_without_recipe(info) for info in infos]
+    if any(each != others[0] for each in others):  # which it refuses, too
+        return
+    recipes = [CloudRecipe.from_dict(info[RECIPE_INFO]) for info in infos if info.get(RECIPE_INFO)]
+    united = infos[0]
+    if len(recipes) == len(infos) and len({(each.keys, each.crop, each.n_points) for each in recipes}) == 1:
+        for meta, recipe in zip(all_metadata, recipes, strict=True):
+            if lines := recipes[0].differences(recipe):
+                logger.warning("The merged recipe is the first dataset's. In '%s' %s.", meta.root, "; ".join(lines))
+    elif recipes:
+        united = others[0]
+        logger.warning("Not kept: the recipe of the clouds, as the datasets' differ in crop, images or points.")
+    for cloud in clouds:
+        cloud["info"] = united
+
+
+def _without_recipe(info: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in info.items() if name != RECIPE_INFO}
+
+
 def run() -> None:
     """LeRobot's command.
 
@@ -58,5 +106,6 @@ def run() -> None:
     from lerobot.scripts.lerobot_edit_dataset import main
 
     let_pandas_hold_arrays()
+    merge_whatever_the_recipe()
     with reported("The dataset could not be edited"):
         main()

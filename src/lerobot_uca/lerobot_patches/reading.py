@@ -115,7 +115,7 @@ def _normalise_by_chosen_episodes(config: TrainPipelineConfig, policy: PointClou
     key_of = {rename_map.get(key, key): key for key in features}
     used = {find_point_cloud(renamed), OBS_STATE, ACTION} & renamed.keys()
     masks = {key_of[name]: key_of.get(valid_mask(name, renamed) or "") for name in used if name}
-    check_finite(dataset, masks)
+    check_finite(dataset, masks, config.dataset.episodes)
     cloud_name = find_point_cloud(renamed)
     if dataset.meta.stats:
         dataset.meta.stats = {**dataset.meta.stats, **chosen_statistics(dataset, masks)}

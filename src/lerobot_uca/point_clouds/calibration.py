@@ -140,7 +140,7 @@ def read_calibrations(folder: Path) -> dict[str, Calibration]:
     for file in files:
         try:
             values = yaml.safe_load(file.read_text(encoding="utf-8"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+        except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
             raise CalibrationError(f"'{file}' must be a YAML file: {' '.join(str(error).split())}") from error
         if not isinstance(values, dict):
             raise CalibrationError(f"'{file}' must hold a calibration, got {type(values).__name__}.")

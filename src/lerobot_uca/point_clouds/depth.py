@@ -104,6 +104,10 @@ class DepthToCloud:
             [selector.points(image, share) for selector, image in zip(self._selectors, images, strict=True)]
         )
 
+    def n_inside(self, images: Sequence[NDArray[Any]]) -> int:
+        """The number of points inside the crop."""
+        return sum(len(selector.chosen(image)[0]) for selector, image in zip(self._selectors, images, strict=True))
+
     def seen(self, images: Sequence[NDArray[Any]]) -> str:
         """The part of the scene that the crop covers, camera by camera, and a unit of depth in which it has points."""
         lines = [describe(view, image, self.crop) for view, image in zip(self.views, images, strict=True)]
@@ -148,15 +152,19 @@ class _Selector:
         self._limits: dict[float, tuple[Points, Points]] = {}
 
     def points(self, image: NDArray[Any], max_points: int | None) -> Points:
+        chosen, depth, unit = self.chosen(image)
+        if max_points is not None and len(chosen) > max_points:
+            chosen = chosen[np.arange(max_points) * len(chosen) // max_points]
+        return self._origin + self._rays[chosen] * (depth[chosen, None] * np.float32(unit))
+
+    def chosen(self, image: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.float32], float]:
+        """Which depths show something inside the crop, as indices; the depths; and their unit [m]."""
         depth = as_image(self.view.camera, image)[self._rows, self._columns].astype(np.float32).ravel()
         unit = self.view.unit or unit_of(image.dtype)
         if unit not in self._limits:
             self._limits[unit] = self._limits_in(unit)
         lowest, highest = self._limits[unit]
-        chosen = np.flatnonzero((depth >= lowest) & (depth <= highest))  # NaN compares as False
-        if max_points is not None and len(chosen) > max_points:
-            chosen = chosen[np.arange(max_points) * len(chosen) // max_points]
-        return self._origin + self._rays[chosen] * (depth[chosen, None] * np.float32(unit))
+        return np.flatnonzero((depth >= lowest) & (depth <= highest)), depth, unit  # NaN compares as False
 
     def _inside(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """The rays' values inside the rectangle of pixels that meet the crop."""

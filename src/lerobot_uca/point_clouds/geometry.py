@@ -7,6 +7,7 @@ Letters: N points, R = H * W rays in row-major order from the top left pixel.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -108,8 +109,12 @@ class Camera:
 
     def depth(self, distances: Array) -> Array:
         """Depths (H, W) along the camera's z axis [m] of points at distances (R,) along the rays [m]."""
-        cosines = 1 / np.linalg.norm(self._rays_at_unit_depth(), axis=1)
-        return np.reshape(distances * cosines, (self.height, self.width))
+        return np.reshape(distances * self._cosines, (self.height, self.width))
+
+    @cached_property
+    def _cosines(self) -> Array:
+        """Depth of each pixel's point a metre along its ray, (R,): a simulated camera asks at each step."""
+        return 1 / np.linalg.norm(self._rays_at_unit_depth(), axis=1)
 
     def _rays_at_unit_depth(self) -> Array:
         """Camera frame, (R, 3)."""

@@ -4,6 +4,7 @@ import csv
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -36,7 +37,7 @@ class ZarrSource(Source):
             raise UserError("DP3's data need zarr: pip install 'lerobot_policy_uca_flow[convert]'.") from error
         try:
             group: Any = zarr.open_group(str(self.path), mode="r")
-            missing = [key for key in ZARR_KEYS if key not in group]
+            missing = [key for key in ZARR_KEYS if key not in group or isinstance(group[key], zarr.Group)]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise UserError(f"'{self.path}' cannot be read as zarr: {' '.join(str(error).split())}") from error
         if missing:
@@ -82,6 +83,11 @@ class ZarrSource(Source):
             return np.asarray(group[key][steps])
         except (OSError, RuntimeError, TypeError, ValueError) as error:  # of a damaged chunk, each codec its own
             raise UserError(f"'{self.path}': {key} cannot be read: {' '.join(str(error).split())}") from error
+
+    @property
+    def cloud_size(self) -> int:
+        """The number of points of each cloud."""
+        return self._group[ZARR_KEYS[0]].shape[1]
 
     def left_out(self) -> list[str]:
         """Arrays that are not kept, and colours."""
@@ -163,22 +169,39 @@ class FolderSource(Source):
         """The steps of one episode."""
         return map(self._frame, self._episodes[episode])
 
+    def left_out(self) -> list[str]:
+        """Columns that are not kept, and colours."""
+        columns = list(self._rows[0])
+        kept = {"file", "episode", "task", *self._columns(columns, "state"), *self._columns(columns, "action")}
+        has_colours = not self.colour and self._points(self._rows[0]).shape[1] > 3
+        return [f"column {name}" for name in columns if name not in kept] + ["the points' colours"] * has_colours
+
     def _frame(self, row: dict[str, str]) -> Frame:
-        file = self.path / row["file"]
-        reader = READERS.get(file.suffix.lower())
-        if reader is None:
-            raise UserError(f"'{file}' must be one of {', '.join(READERS)}.")
-        try:
-            points = reader(file)
+        with self._reading(row):
             state, action = (
                 np.array([float(row[name]) for name in self._columns(list(row), kind)], dtype=np.float32)
                 for kind in ("state", "action")
             )
-        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-            raise UserError(f"'{file}' (frames.csv) cannot be read: {' '.join(str(error).split())}") from error
+        return Frame(*self._cropped(self._points(row)), state, action, row.get("task") or self.task)
+
+    def _points(self, row: dict[str, str]) -> NDArray[Any]:
+        file = self.path / row["file"]
+        reader = READERS.get(file.suffix.lower())
+        if reader is None:
+            raise UserError(f"'{file}' must be one of {', '.join(READERS)}.")
+        with self._reading(row):
+            points = reader(file)
         if points.ndim != 2 or points.shape[1] < 3:
             raise UserError(f"'{file}' must hold points (N, 3 or more), got shape {points.shape}.")
-        return Frame(*self._cropped(points), state, action, row.get("task") or self.task)
+        return points
+
+    @contextmanager
+    def _reading(self, row: dict[str, str]) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+            reason = " ".join(str(error).split())
+            raise UserError(f"'{self.path / row['file']}' (frames.csv) cannot be read: {reason}") from error
 
 
 def _read_ply(file: Path) -> NDArray[Any]:

@@ -109,6 +109,16 @@ class LeRobotSource(Source):
         """Whether there are depth images."""
         return bool(depth_keys(self.features))
 
+    @property
+    def has_clouds(self) -> bool:
+        """Whether there are clouds."""
+        return self._cloud_key is not None
+
+    @property
+    def cloud_size(self) -> int | None:
+        """The number of points of each of its own clouds; None if they are made from depth."""
+        return self._cloud_shape[0] if self.depth_recipe is None and self.has_clouds else None
+
     def make_clouds(
         self, corners: tuple[Any, Any] | None, n_points: int, folder: str | None, episodes: Sequence[int]
     ) -> None:
@@ -149,7 +159,9 @@ class LeRobotSource(Source):
             kept |= {*self.depth_recipe.keys, *(kind + each for kind in (INTRINSICS, EXTRINSICS) for each in cameras)}
         own = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
         lost = [LOST_RECIPE] if self.depth_recipe is None and self._made_with and self.recipe is None else []
-        return [key for key in self.features if key not in kept | own] + lost
+        has_colours = self.depth_recipe is None and not self.colour and self._cloud_shape[-1] > 3
+        colours = [f"colours of {self._cloud_key}"] * has_colours
+        return [key for key in self.features if key not in kept | own] + colours + lost
 
     def frames(self, episode: int) -> Iterator[Frame]:
         """The steps of one episode."""
@@ -166,6 +178,10 @@ class LeRobotSource(Source):
     @cached_property
     def _cloud_key(self) -> str | None:
         return find_point_cloud(self.features)
+
+    @property
+    def _cloud_shape(self) -> tuple[int, ...]:
+        return tuple(self.features[self._cloud_key]["shape"]) if self._cloud_key else (0, 0)
 
     @cached_property
     def _made_with(self) -> CloudRecipe | None:
@@ -188,17 +204,17 @@ class LeRobotSource(Source):
         state, action = (np.atleast_1d(item[key].numpy()).astype(np.float32) for key in (STATE, ACTION))
         return Frame(*seen, state, action, item["task"])
 
-    def _from_depth(self, item: dict[str, Any]) -> tuple[NDArray[np.float32], int, float]:
+    def _from_depth(self, item: dict[str, Any]) -> tuple[NDArray[np.float32], int, float, int]:
         assert self.depth_recipe is not None
         images = [item[key].numpy() for key in self.depth_recipe.keys]
         try:
-            candidates, n_points = self._make.candidates(images), len(self._make.points(images))
+            candidates, n_points = self._make.candidates(images), self._make.n_inside(images)
             valid = [is_valid(view, image).mean() for view, image in zip(self._make.views, images, strict=True)]
         except DepthError as error:
             raise UserError(str(error)) from error
-        return candidates, n_points, 1 - float(np.mean(valid))
+        return candidates, n_points, 1 - float(np.mean(valid)), 0
 
-    def _from_cloud(self, item: dict[str, Any]) -> tuple[NDArray[np.float32], int, float]:
+    def _from_cloud(self, item: dict[str, Any]) -> tuple[NDArray[np.float32], int, float, int]:
         if self._cloud_key is None:
             raise UserError(f"'{self.path}' has neither depth nor a point cloud, got {', '.join(self.features)}.")
         cloud = item[self._cloud_key].numpy()

@@ -27,7 +27,8 @@ class Frame(NamedTuple):
 
     points: NDArray[np.float32]  # (any number, 3) [m], or 6 with RGB; inside the crop; of depth the sampled ones
     n_points: int  # inside the crop
-    invalid: float  # share of pixels without depth, or of points that are not finite
+    invalid: float  # share of pixels without depth, or of points that are not finite or missing
+    n_missing: int  # points at (0, 0, 0), which stand for missing ones
     state: NDArray[np.float32]  # (S,)
     action: NDArray[np.float32]  # (A,)
     task: str
@@ -101,12 +102,20 @@ class Source(ABC):
         """The names of a feature's numbers, if the source knows them."""
         return None
 
+    @property
+    def cloud_size(self) -> int | None:
+        """The number of points of each recorded cloud, if all have the same."""
+        return None
+
     def left_out(self) -> list[str]:
         """The parts of the source that are not kept."""
         return []
 
-    def _cropped(self, points: NDArray[Any]) -> tuple[NDArray[np.float32], int, float]:
-        """The finite points inside the crop, of (N, 3 or more), their number, and the share that is not finite.
+    def _cropped(self, points: NDArray[Any]) -> tuple[NDArray[np.float32], int, float, int]:
+        """Of points (N, 3 or more) the good ones inside the crop, their number, the share of bad ones, and the missing.
+
+        Bad are those that are not finite, and those at (0, 0, 0): cameras, and the baselines' Adroit, write that where
+        there is none.
 
         Raises:
             UserError: if their colours are wanted and they have none.
@@ -117,7 +126,8 @@ class Source(ABC):
                 f"--colour=true needs points with RGB after xyz, (N, 6), got {points.shape} in '{self.path}'."
             )
         wanted = np.asarray(points, dtype=np.float32)[:, :n_channels]
-        finite = np.asarray(np.all(np.isfinite(wanted), axis=1))
-        xyz = np.where(finite[:, None], wanted[:, :3], np.inf)
-        inside = finite if self.crop is None else finite & self.crop.contains(xyz)
-        return wanted[inside], int(inside.sum()), 1 - float(finite.mean()) if len(finite) else 1.0
+        is_missing = ~wanted[:, :3].any(axis=1)
+        good = np.asarray(np.all(np.isfinite(wanted), axis=1)) & ~is_missing
+        xyz = np.where(good[:, None], wanted[:, :3], np.inf)
+        inside = good if self.crop is None else good & self.crop.contains(xyz)
+        return wanted[inside], int(inside.sum()), 1 - float(good.mean()) if len(good) else 1.0, int(is_missing.sum())
