@@ -86,7 +86,7 @@ def test_a_demonstration_cannot_end_before_it_is_one(tmp_path):
 
 
 def test_a_demonstration_cannot_end_before_its_success_is_decided(tmp_path):
-    with pytest.raises(UserError, match=r"when env\.success=final is not decided yet: add --env\.success=any\."):
+    with pytest.raises(UserError, match=r"before env\.success=final is decided: add --env\.success=any\."):
         collect(config(tmp_path / "new", env=AdroitPointCloudConfig(task="door"), successful_steps=10))
 
 

@@ -831,3 +831,15 @@ def test_the_command(depth_dataset, tmp_path, monkeypatch, capsys):
     assert f"1 episodes, 6 frames of 48 points: {tmp_path / 'clouds'}" in capsys.readouterr().out
     assert json.loads((tmp_path / "clouds" / "meta" / "info.json").read_text())["total_frames"] == 6
     assert DEPTH_KEY not in LeRobotDataset("test/clouds", root=tmp_path / "clouds").features
+
+
+def test_an_episode_that_cannot_be_read_can_be_left_out(tmp_path):
+    write_folder(tmp_path / "recorded", "npz")
+    (tmp_path / "recorded" / "0.npz").write_bytes(b"damaged")
+    dataset = convert(config(tmp_path / "recorded", tmp_path / "clouds", fps=5, episodes=[1]))
+    assert dataset.num_episodes == 1
+
+
+def test_clouds_that_there_are_not_cannot_be_taken(depth_dataset, tmp_path):
+    with pytest.raises(UserError, match="--use_clouds=true needs a LeRobot dataset with clouds, got"):
+        convert(config(depth_dataset.root, tmp_path / "clouds", use_clouds=True))

@@ -66,7 +66,8 @@ SLURM = {
 """The commands of a Slurm on which one task has ended, one runs and one waits."""
 
 
-def test_slurm_tasks_end_with_ctrl_c(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("end", "cancelled"), [(KeyboardInterrupt, ["7_1", "7_2"]), (SystemExit, [])])
+def test_slurm_tasks_end_with_ctrl_c_and_not_with_the_connection(tmp_path, monkeypatch, end, cancelled):
     submitit = pytest.importorskip("submitit")
     for name, command in SLURM.items():
         (tmp_path / name).write_text(f"#!/bin/sh\n{command.format(folder=tmp_path)}\n")
@@ -76,13 +77,14 @@ def test_slurm_tasks_end_with_ctrl_c(tmp_path, monkeypatch):
     ends = on_slurm({"partition": "short"}, 2)(tmp_path, [CELL._replace(seed=seed) for seed in range(3)], None)
     assert next(ends).reason.startswith("Slurm gave it up: ")
 
-    def ctrl_c(seconds):
-        raise KeyboardInterrupt
+    def sleep(seconds):
+        raise end
 
-    monkeypatch.setattr(launchers.time, "sleep", ctrl_c)
-    with pytest.raises(KeyboardInterrupt):
+    (tmp_path / "cancelled").touch()
+    monkeypatch.setattr(launchers.time, "sleep", sleep)
+    with pytest.raises(end):
         next(ends)
-    assert (tmp_path / "cancelled").read_text().split() == ["7_1", "7_2"]
+    assert (tmp_path / "cancelled").read_text().split() == cancelled
     assert "#SBATCH --array=0-2%2\n" in (tmp_path / "submission.sh").read_text()
 
 

@@ -1,6 +1,7 @@
 """Tables and figures of results made up so that every number can be told in advance."""
 
 import csv
+import errno
 import json
 import re
 import shutil
@@ -14,6 +15,7 @@ from tests.browser import browser, needs_browser
 from tests.robots.conftest import wait_until
 
 from lerobot_uca.errors import UserError
+from lerobot_uca.protocol import results
 from lerobot_uca.protocol.cells import PAPER_GROUPS, POLICIES, SUITES, Cell
 from lerobot_uca.protocol.command import main
 from lerobot_uca.protocol.figures import COLOURS, FIGURES
@@ -324,6 +326,26 @@ def test_a_report_does_not_mix_with_other_things(folder, tmp_path):
     (output / "cells.json").unlink()
     with pytest.raises(UserError, match=r"--output '.*/mine' holds other things than a report: choose a new or empty"):
         main(["report", str(folder.path), f"--output={output}"])
+
+
+@pytest.mark.parametrize("n_written", [0, 1, 2])
+def test_a_report_that_was_interrupted_is_made_again(folder, tmp_path, monkeypatch, n_written):
+    files = iter(range(n_written))
+
+    def until_the_disk_is_full(write):
+        def write_next(*args):
+            if next(files, None) is None:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            write(*args)
+
+        return write_next
+
+    with monkeypatch.context() as patch:
+        for name in ("write_json", "write_rows"):
+            patch.setattr(results, name, until_the_disk_is_full(getattr(results, name)))
+        with pytest.raises(UserError, match="No space left on device"):
+            main(["report", str(folder.path), f"--output={tmp_path}/report"])
+    main(["report", str(folder.path), f"--output={tmp_path}/report"])
 
 
 def test_a_report_leaves_no_figures_of_the_one_before(folder, tmp_path):

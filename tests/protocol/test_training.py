@@ -43,8 +43,16 @@ def test_a_command_that_fails_says_why(tmp_path):
     assert "working\n" in (tmp_path / "log").read_text()
 
 
+def test_a_record_says_whose_expert_it_was():
+    tasks = ("metaworld/soccer", "metaworld/door-open", "metaworld/push")
+    assert [training._identity(None, Cell(task, "uca_flow", 0)) for task in tasks] == [
+        *["ours, built in"] * 2,
+        "built in",
+    ]
+
+
 def test_nothing_of_the_working_directory_is_imported(tmp_path, monkeypatch):
-    (tmp_path / "ctypes.py").write_text("raise SystemExit('a person's own')")
+    (tmp_path / "ctypes.py").write_text("raise SystemExit('of a person')")
     monkeypatch.chdir(tmp_path)
     run_python("print('done')", tmp_path / "log")
 

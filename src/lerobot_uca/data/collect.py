@@ -128,7 +128,7 @@ def _check_successful_steps(config: CollectConfig, env_config: PointCloudEnvConf
     least = env.min_successful_steps
     if env.succeeds_at_the_end:
         raise UserError(
-            "--successful_steps ends an episode before its time, when env.success=final is not decided yet: add "
+            "--successful_steps ends an episode before its time, and so before env.success=final is decided: add "
             "--env.success=any."
         )
     if config.successful_steps < least:

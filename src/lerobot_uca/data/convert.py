@@ -138,6 +138,8 @@ def make_source(config: ConvertConfig) -> tuple[Source, Sequence[int]]:
         crop = optional_crop(config.crop_low, config.crop_high)
         source = find_source(config.source, crop, config.task, colour=config.colour)
         episodes = source.choose(config.episodes)
+        if config.use_clouds and not (isinstance(source, LeRobotSource) and source.has_clouds):
+            raise UserError(f"--use_clouds=true needs a LeRobot dataset with clouds, got '{config.source}'.")
         if isinstance(source, LeRobotSource) and source.has_depth and not config.use_clouds:
             _make_clouds(config, source, crop, episodes)
         elif config.calibration is not None:

@@ -88,7 +88,8 @@ def _unite_recipes(all_metadata: Sequence[LeRobotDatasetMetadata]) -> None:
                 logger.warning("The merged recipe is the first dataset's. In '%s' %s.", meta.root, "; ".join(lines))
     elif recipes:
         united = others[0]
-        logger.warning("Not kept: the recipe of the clouds, as the datasets' differ in crop, images or points.")
+        reason = "the datasets' differ in crop, images or points" if len(recipes) == len(infos) else "not all have one"
+        logger.warning("Not kept: the recipe of the clouds, as %s.", reason)
     for cloud in clouds:
         cloud["info"] = united
 

@@ -5,6 +5,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from lerobot_uca.point_clouds.geometry import Array
 
 NUMBA: Any = numba.config
-FORGOTTEN_AFTER = 7 * 24 * 3600  # [s], what was compiled from another state of these modules
+FORGOTTEN_AFTER = 7 * 24 * 3600  # [s]
 
 MIN_DENOMINATOR = 1e-15  # mjMINVAL: MuJoCo takes a ray as parallel to a surface below it
 
@@ -48,15 +49,24 @@ def _cache() -> Path:
     """
     modules = Path(__file__).parent
     base = Path(NUMBA.CACHE_DIR or modules / "__pycache__")
-    if not os.access(base if base.exists() else base.parent, os.W_OK):
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_uca"
-    digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(modules.glob("*.py"))))
+    if not NUMBA.CACHE_DIR and not os.access(base if base.exists() else modules, os.W_OK):
+        with suppress(RuntimeError):  # there is no home; then Numba finds no folder either
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_uca"
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(modules.glob("[!.]*.py"))))
     cache = base / f"rays_{digest.hexdigest()[:16]}"
-    if not cache.exists():
-        for other in base.glob("rays_*"):
-            if time.time() - other.stat().st_mtime > FORGOTTEN_AFTER:
-                shutil.rmtree(other, ignore_errors=True)
+    with suppress(OSError):  # another process may tidy up, too
+        if cache.exists():
+            os.utime(cache)
+        else:
+            _forget(base)
     return cache
+
+
+def _forget(base: Path) -> None:
+    """Remove what was compiled from other states of the modules and has not been used for long."""
+    for other in base.glob("rays_*"):
+        if time.time() - other.stat().st_mtime > FORGOTTEN_AFTER:
+            shutil.rmtree(other, ignore_errors=True)
 
 
 CACHE = _cache()

@@ -166,7 +166,7 @@ def _connect(ray: Any, address: str) -> None:
 def on_slurm(options: Mapping[str, str], n_parallel: int | None = None, cluster: str = "slurm") -> Launcher:
     """Run as a Slurm array, one task a cell, through submitit. The nodes share the disk.
 
-    Tasks that have not ended are cancelled when the launcher is left, with Ctrl-C for example.
+    Ctrl-C cancels the tasks that have not ended. Without this process they go on, and the same command takes them up.
 
     Args:
         options: of sbatch, by their long names: partition, time, gres, ...
@@ -201,8 +201,9 @@ def on_slurm(options: Mapping[str, str], n_parallel: int | None = None, cluster:
                     except (submitit.core.utils.FailedJobError, submitit.core.utils.UncompletedJobError) as error:
                         yield Ended(cell, Outcome.FAILED, f"Slurm gave it up: {' '.join(str(error).split())[:300]}")
                 time.sleep(POLL_SECONDS)
-        finally:
+        except (KeyboardInterrupt, GeneratorExit):  # not if the connection to this machine is lost: they go on
             for job in running:
                 job.cancel(check=False)  # it may have ended meanwhile
+            raise
 
     return launch

@@ -96,6 +96,8 @@ def _check_output(output: Path, results: Results, runs: Sequence[Path]) -> None:
             return
     except OSError as error:
         raise UserError(f"--output '{output}' cannot be written: {error}") from error
+    if {each.name for each in output.iterdir()} == {RECORDS}:  # of one that was interrupted at once
+        return
     if not all((output / name).is_file() for name in (SETTING, RECORDS)):
         raise UserError(f"--output '{output}' holds other things than a report: choose a new or empty folder.")
     kept = {tuple(row.as_text()) for row in results.rows}

@@ -97,6 +97,8 @@ class Results:
 
     def write(self, folder: Path) -> None:
         """Write all of it into a folder that `read` reads, in place of other results there."""
+        # First, since a folder with both is a report, which a second try may replace.
+        write_json(folder / RECORDS, {"cells": [self.records[cell] for cell in sorted(self.records)]})
         write_json(folder / SETTING, self.setting.as_values())
         by_file: dict[Path, list[Row]] = defaultdict(list)  # of up to 0.6 MB, 37 tasks each
         for row in self.rows:
@@ -106,7 +108,6 @@ class Results:
         for path in {*folder.glob("episodes*.csv")} - {*by_file}:
             if _WRITTEN.fullmatch(path.name):
                 path.unlink()
-        write_json(folder / RECORDS, {"cells": [self.records[cell] for cell in sorted(self.records)]})
 
     def seeds(self, task: str, policy: str) -> list[int]:
         """Training seeds whose last checkpoint is evaluated."""

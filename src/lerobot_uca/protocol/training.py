@@ -14,13 +14,14 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
+from lerobot_uca.envs.experts import metaworld_experts
 from lerobot_uca.features import POINT_CLOUD
 from lerobot_uca.protocol.cells import Cell
 from lerobot_uca.protocol.folder import CellFolder, RunFolder, read_json, write_json
 from lerobot_uca.protocol.setting import Setting
 from lerobot_uca.protocol.tied import tied
 
-BUILT_IN = "built in"
+BUILT_IN, OURS = "built in", "ours, built in"
 LOG_TAIL = 2000  # characters in which a failing command has said why
 
 
@@ -73,6 +74,8 @@ def _made_by(dataset: Path) -> Path:
 
 def _identity(expert: str | None, cell: Cell) -> str:
     """What demonstrates a task: a dataset, or a file by what it holds, wherever it lies."""
+    if cell.benchmark == "metaworld" and cell.env_task in metaworld_experts.EXPERTS:
+        return OURS
     if expert is None or cell.benchmark != "adroit":
         return BUILT_IN
     path = Path(expert.replace("{task}", cell.env_task))

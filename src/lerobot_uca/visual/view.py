@@ -68,6 +68,8 @@ class ViewConfig:
     colour: bool = False
     # Folder of the cameras' calibrations; by default $LEROBOT_UCA_CALIBRATION.
     calibration: str | None = None
+    # Of a dataset with both depth and clouds, show the clouds.
+    use_clouds: bool = False
     # Training configuration whose policy.depth.crop_low and crop_high the page's button writes; made if need be.
     config: Path = field(default_factory=lambda: Path("crop.yaml"))
     # Write a picture of the first frame instead.
@@ -99,7 +101,7 @@ def clouds_of(config: ViewConfig) -> Generator[NDArray[np.float32]]:
         episode = source.choose(None)[0] if config.episode is None else config.episode
         if episode not in source.episodes:
             raise UserError(f"episode must be {source.valid}, got {episode}.")
-        if isinstance(source, LeRobotSource) and source.has_depth:
+        if isinstance(source, LeRobotSource) and source.has_depth and not config.use_clouds:
             source.make_clouds((WIDE.low, WIDE.high), MAX_POINTS // 8, config.calibration, [episode])
     except CalibrationError as error:
         raise UserError(str(error)) from error

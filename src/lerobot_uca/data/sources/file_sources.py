@@ -4,7 +4,7 @@ import csv
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -173,7 +173,9 @@ class FolderSource(Source):
         """Columns that are not kept, and colours."""
         columns = list(self._rows[0])
         kept = {"file", "episode", "task", *self._columns(columns, "state"), *self._columns(columns, "action")}
-        has_colours = not self.colour and self._points(self._rows[0]).shape[1] > 3
+        has_colours = False
+        with suppress(UserError):  # of an episode that is not converted
+            has_colours = not self.colour and self._points(self._rows[0]).shape[1] > 3
         return [f"column {name}" for name in columns if name not in kept] + ["the points' colours"] * has_colours
 
     def _frame(self, row: dict[str, str]) -> Frame:

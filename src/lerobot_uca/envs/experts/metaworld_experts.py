@@ -89,9 +89,9 @@ class PegInsertSide:
 class DoorOpen:
     """Comes down behind the door's handle, hooks it, and pulls until the door is open.
 
-    Meta-World's begins to go down, and to pull, within 12 cm of the handle: where the door is on the left, the hand
-    comes down in front of the handle and stays there. And it rises where a swinging door is 12 cm ahead of the hand,
-    so that the door swings on alone, and at times not far enough.
+    Meta-World's goes down within 12 cm of a place in front of the handle: where the door is on the left, the hand comes
+    down there, in front, and stays. And it rises where a swinging door is so far ahead of the hand, so that the door
+    swings on alone, and at times not far enough.
     """
 
     BEHIND = np.array([0.01, 0.02])
@@ -101,7 +101,7 @@ class DoorOpen:
     HIGH = 0.2
     """Height of the hand above the handle on its way [m]."""
     HOOKED = 0.04, 0.02, 0.16
-    """It pulls where it is at most so high above the handle, so far in front of it, and so far from it [m]."""
+    """It pulls where it is at most so high above the handle, so far in front, and horizontally so far from it [m]."""
     AHEAD = 0.05
     """How far in front of the handle the hand wants to be while it pulls [m]."""
 
