@@ -52,7 +52,8 @@ def evaluate(checkpoint: Path, env_config: Any, seeds: range, n_videos: int) -> 
     begin = time.perf_counter()
     config: Any = PreTrainedConfig.from_pretrained(checkpoint)
     config.inference = "eager"
-    env_config.observation = config.observation
+    if hasattr(config, "observation"):  # not in the versions that --before compares with
+        env_config.observation = config.observation
     policy_class: Any = get_policy_class(config.type)
     policy = policy_class.from_pretrained(checkpoint, config=config).eval()
     draw_by_episode(policy, seeds)
@@ -87,7 +88,8 @@ def draw_by_episode(policy: Any, seeds: range) -> None:
     def reset_and_seed() -> None:
         nonlocal n_calls
         n_calls = 0
-        batch = [waiting.pop(0) for _ in range(min(N_ENVS, len(waiting)))]
+        batch, waiting[:] = waiting[:N_ENVS], waiting[N_ENVS:]
+        batch += range(seeds.stop, seeds.stop + N_ENVS - len(batch))  # LeRobot runs all environments, also at the end
         generators[:] = [torch.Generator().manual_seed(seed) for seed in batch]
         reset()
 

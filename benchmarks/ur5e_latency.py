@@ -1,7 +1,8 @@
 """Milliseconds from a depth frame to the moved setpoint at the controller, by stage.
 
     observe        the driver's: the arm's state and the newest frame, 640 x 480, of a camera in another process
-    cloud, policy  1024 points, the network of ur5e_small; weights do not change the time
+    cloud, policy  1024 points, all of which the policy sees (ur5e_small: 256), else the network of ur5e_small on
+                   random data; weights do not change the time
     send_action    checked, clipped, sent to the process that talks to the arm
     channel        until a setpoint that differs has come to the controller, by way of the servo loop
 

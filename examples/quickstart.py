@@ -3,6 +3,7 @@
 Complete results are reused; remove outputs/quickstart to start over.
 """
 
+import argparse
 import json
 import shlex
 import shutil
@@ -62,6 +63,7 @@ STEPS = (
 
 def main() -> None:
     """Run the steps that are not complete, then report."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(f"UCA-Flow quickstart: Meta-World's {TASK}. To repeat a command: source .venv/bin/activate")
     for index, step in enumerate(STEPS):
         print(f"\n$ {step.command}")

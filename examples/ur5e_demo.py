@@ -1,9 +1,10 @@
 """A UR5e's whole story without one: a simulated arm is recorded, policies trained, rolled out, an episode replayed.
 
 The commands are those for a real arm (docs/real_robot.md), each printed so that it can be repeated while
-`lerobot-uca-ur5e-sim` runs. Complete results, trials too, are reused; remove outputs/ur5e_demo to start over. Beside
-them lie a recording of the clouds for Rerun, the picture of what decides (saliency) and a film of the first trial. On
-two cores a task takes about half an hour; --demonstrations=5 --steps=50 --trials=1 shows every command in five minutes.
+`lerobot-uca-ur5e-sim` runs. Complete results, trials too, are reused where the same commands made them, and others are
+made anew; remove outputs/ur5e_demo to start over. Beside them lie a recording of the clouds for Rerun, the picture of
+what decides (saliency) and a film of the first trial. On two cores a task takes about half an hour; --demonstrations=5
+--steps=50 --trials=1 shows every command in five minutes.
 """
 
 import argparse
@@ -103,14 +104,14 @@ def run_task(name: str, task: Task, options: argparse.Namespace) -> list[str]:
             f"--dataset.{times[0]} --dataset.{times[1]} --dataset.video=false --dataset.push_to_hub=false "
             "--play_sounds=false"
         )
-        run(record, complete=dataset / "meta" / "info.json", unfinished=dataset)
+        recorded = make(record, dataset)
         convert = (
             f"lerobot-uca-convert --source={dataset} --repo_id=local/{name}_clouds --root={clouds} "
             f"--crop_low='{task.crop[0]}' --crop_high='{task.crop[1]}' --n_points={task.n_points}"
         )
-        run(convert, complete=clouds)
+        converted = make(convert, clouds, after=recorded)
         recording = folder / "demonstrations.rrd"
-        run(f"lerobot-uca-view --source={clouds} --rrd={recording}", complete=recording)
+        make(f"lerobot-uca-view --source={clouds} --rrd={recording}", recording, after=converted)
         for method in options.methods:
             training = folder / method
             checkpoint = training / "checkpoints" / "last" / "pretrained_model"
@@ -118,10 +119,10 @@ def run_task(name: str, task: Task, options: argparse.Namespace) -> list[str]:
                 f"lerobot-train --config_path=ur5e_small --dataset.repo_id=local/{name}_clouds --dataset.root={clouds} "
                 f"--output_dir={training} --steps={steps} --seed={SEED} {task.options} {METHODS[method]}"
             )
-            run(train, complete=checkpoint / "model.safetensors", unfinished=training)
+            trained = make(train, training, after=converted)
             pictures = folder / f"{method}_saliency"
             draw = f"lerobot-uca-saliency {checkpoint} {clouds} --output={pictures} --rerun"
-            run(draw, complete=pictures / "saliency.rrd")
+            make(draw, pictures, after=trained)
             rollout = (
                 f"lerobot-rollout --policy.path={checkpoint} {robot} {camera} --fps={FPS} --duration={seconds + 2} "
                 f"--task='{task.sentence}' --play_sounds=false"
@@ -219,14 +220,27 @@ def add_row(file: Path, row: tuple[object, ...]) -> None:
         writer.writerow([*row, *made.values()])
 
 
-def run(command: str, complete: Path | None = None, unfinished: Path | None = None) -> None:
-    """Run a command of this interpreter's environment, unless what it makes is there."""
+def make(command: str, output: Path, after: str = "") -> str:
+    """Run a command, unless what it makes is there, made by it after the same commands; return all of these.
+
+    A file beside the output holds them. It is written when the output is complete, whose own files may be there before.
+    """
+    commands, made_by = f"{after}{command}\n", output.with_name(f".{output.name}.made_by")
+    if output.exists() and made_by.is_file() and made_by.read_text(encoding="utf-8") == commands:
+        print(f"\n$ {command}\n  (complete: {output})", flush=True)
+        return commands
+    made_by.unlink(missing_ok=True)
+    if output.exists():
+        print(f"\n{output} is not complete, or other commands made it: it is removed.")
+        shutil.rmtree(output) if output.is_dir() else output.unlink()
+    run(command)
+    made_by.write_text(commands, encoding="utf-8")
+    return commands
+
+
+def run(command: str) -> None:
+    """Run a command of this interpreter's environment."""
     print(f"\n$ {command}", flush=True)
-    if complete is not None and complete.exists():
-        print(f"  (complete: {complete})")
-        return
-    if unfinished is not None:
-        shutil.rmtree(unfinished, ignore_errors=True)
     began = time.monotonic()
     check(start(command).wait())
     print(f"  (took {time.monotonic() - began:.0f} s)")

@@ -35,8 +35,15 @@ for _part in (
 ):
     _load(_part)
 
+_guard = _load("lerobot_patches.guard")
 _patches = _load("lerobot_patches.install")
-if _patches is not None:
-    _patches.install()  # type: ignore[attr-defined]
+try:
+    if _guard is not None:
+        _guard.make_registered_steps_only()  # type: ignore[attr-defined]
+    elif is_supported():
+        raise ImportError("lerobot_policy_uca_flow: without its check of checkpoints one could run code.")
+finally:
+    if _patches is not None:
+        _patches.install()  # type: ignore[attr-defined]
 if not is_supported():
     warn_of_another(_missing)

@@ -5,6 +5,7 @@ import importlib.metadata
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 import venv
 import zipfile
@@ -119,6 +120,20 @@ def test_a_wheel_holds_the_package_and_nothing_else(wheel):
     assert {"lerobot_uca/configs/uca_flow_small.yaml", "lerobot_uca/configs/uca_flow_paper.yaml"} <= set(names)
 
 
+def test_a_wheel_made_from_the_source_distribution_is_the_same(wheel, tmp_path):
+    """As `python -m build` makes it, and pip from an index without a wheel."""
+    build = [sys.executable, "-m", "hatchling", "build", "-d", str(tmp_path)]
+    subprocess.run([*build, "-t", "sdist"], check=True, capture_output=True, cwd=SOURCE.parent.parent)
+    (archive,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(archive) as files:
+        files.extractall(tmp_path / "unpacked", filter="data")
+    (folder,) = (tmp_path / "unpacked").iterdir()
+    subprocess.run([*build, "-t", "wheel"], check=True, capture_output=True, cwd=folder)
+    (path,) = tmp_path.glob("*.whl")
+    assert sorted(zipfile.ZipFile(path).namelist()) == sorted(wheel.namelist())
+    assert {"README.md", "LICENSE", "pyproject.toml"} <= {each.name for each in folder.iterdir()}
+
+
 def test_the_wheels_readme_has_no_links_into_the_repository(wheel):
     (metadata,) = (name for name in wheel.namelist() if name.endswith(".dist-info/METADATA"))
     text = wheel.read(metadata).decode()
@@ -215,6 +230,7 @@ def test_lerobot_discovers_everything_in_a_fresh_interpreter():
         f"absent = {absent}"
         """
 import sys
+import tarfile
 sys.modules.update(dict.fromkeys(absent))
 import lerobot.scripts.lerobot_train
 before = {name.split(".")[0] for name in sys.modules}
@@ -281,6 +297,24 @@ assert hasattr(factory.make_dataset, "__wrapped__")
     assert result.returncode == 0, result.stderr
     assert "check_settings is missing: AttributeError: module 'lerobot' has no" in result.stderr
     assert result.stderr.count("is missing") == 1
+
+
+def test_no_part_that_is_broken_takes_the_check_of_checkpoints_down():
+    after = """
+from lerobot.processor import DataProcessorPipeline
+try:
+    DataProcessorPipeline._build_steps_from_config({"steps": [{"class": "os.system"}]}, {})
+except ValueError as error:
+    print(error)
+"""
+    result = load('import sys; sys.modules["lerobot_uca.configs"] = None', after)
+    assert "lerobot_uca.lerobot_patches.install is not available" in result.stderr
+    assert "'os.system' is not registered by LeRobot or an installed plugin; it was not run" in result.stdout
+
+
+def test_where_the_check_of_checkpoints_is_broken_the_import_fails():
+    result = load('import sys; sys.modules["lerobot_uca.checkpoints.steps"] = None', "")
+    assert result.stderr.endswith("without its check of checkpoints one could run code.\n")
 
 
 def test_without_the_check_of_checkpoints_the_import_fails_and_leaves_the_rest():

@@ -3,13 +3,13 @@
 import logging
 
 from lerobot_uca.lerobot_patches.checkpoints import (
-    make_registered_steps_only,
     report_damaged_checkpoints,
     report_failed_uploads,
     resume_exactly,
     save_checkpoints_whole,
 )
 from lerobot_uca.lerobot_patches.ending import end_together
+from lerobot_uca.lerobot_patches.guard import make_registered_steps_only
 from lerobot_uca.lerobot_patches.messages import is_command, report_user_errors, shorten_decoder_warning
 from lerobot_uca.lerobot_patches.reading import normalise_what_is_trained, read_in_batches
 from lerobot_uca.lerobot_patches.recording import record_what_can_be_trained
