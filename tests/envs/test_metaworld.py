@@ -20,7 +20,7 @@ from lerobot_uca.envs.metaworld import (
     task_groups,
 )
 from lerobot_uca.errors import UserError
-from lerobot_uca.point_clouds.geometry import Crop, opengl_from_opencv
+from lerobot_uca.point_clouds.geometry import Crop, opencv_from_opengl
 from lerobot_uca.protocol.cells import PAPER_GROUPS
 
 
@@ -47,7 +47,7 @@ def test_the_camera_is_metaworlds_corner2_moved(env):
     assert CLOUD_CAMERA.position == pytest.approx((0.6, 0.295, 0.8))  # the baselines'
     simulator.model.cam_pos[camera] = CLOUD_CAMERA.position
     mujoco.mj_forward(simulator.model, simulator.data)
-    rotation = opengl_from_opencv(np.asarray(CLOUD_CAMERA.X_world_camera))[:3, :3]
+    rotation = opencv_from_opengl(np.asarray(CLOUD_CAMERA.X_world_camera))[:3, :3]
     np.testing.assert_allclose(simulator.data.cam_xmat[camera].reshape(3, 3), rotation, atol=1e-12)
     np.testing.assert_allclose(simulator.data.cam_xpos[camera], CLOUD_CAMERA.position)
     fovy = 2 * np.degrees(np.arctan(CLOUD_CAMERA.height / 2 / CLOUD_CAMERA.fy))

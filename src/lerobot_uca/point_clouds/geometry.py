@@ -23,13 +23,8 @@ KD_TREE_HEIGHT = 3
 
 
 def opencv_from_opengl(X_world_camera: Array) -> Array:
-    """The pose (4, 4) in OpenCV's convention (y down, z forward) of a camera in OpenGL's (y up, z backward)."""
+    """A camera's pose (4, 4) from OpenGL's convention (y up, z backward) to OpenCV's (y down, z forward), or back."""
     return np.asarray(X_world_camera, dtype=np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def opengl_from_opencv(X_world_camera: Array) -> Array:
-    """The inverse of `opencv_from_opengl`, which is its own inverse."""
-    return opencv_from_opengl(X_world_camera)
 
 
 def as_pose(X: Array) -> Pose:
