@@ -1,8 +1,7 @@
 """Milliseconds from a depth frame to the moved setpoint at the controller, by stage.
 
     observe        the driver's: the arm's state and the newest frame, 640 x 480, of a camera in another process
-    cloud, policy  1024 points, all of which the policy sees (ur5e_small: 256), else the network of ur5e_small on
-                   random data; weights do not change the time
+    cloud, policy  1024 points, the network of ur5e_small, which sees 256 of them; weights do not change the time
     send_action    checked, clipped, sent to the process that talks to the arm
     channel        until a setpoint that differs has come to the controller, by way of the servo loop
 
@@ -85,7 +84,7 @@ def measure(robot: UR5eFollower, controller: Controller, n_calls: int, inference
     """Milliseconds, a row for each call and a column for each stage."""
     to_cloud = DepthToCloud([DepthView(simulated_camera(640, 480))], CROP, N_POINTS)
     policy = make_policy(
-        cloud_points=N_POINTS, dim=128, inference=inference, obs_stride=2, horizon=16, n_action_steps=1
+        cloud_points=N_POINTS, n_points=256, dim=128, inference=inference, obs_stride=2, horizon=16, n_action_steps=1
     )
     observed = robot.get_observation()
     observation = {key: observed[key] for key in JOINT_KEYS}
