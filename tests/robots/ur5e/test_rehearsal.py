@@ -185,22 +185,24 @@ def test_a_camera_that_fails_stops_the_arm_in_one_line(world, tmp_path, fault):
     scene = SceneClient(address)
     robot = UR5eFollower(robot_config(address, tmp_path, top=SimulatedCameraConfig(ip=address, use_rgb=True)))
     assert robot.observation_features["top_depth"] == (120, 160, 1)
-    with robot:
-        observation = robot.get_observation()
-        assert observation["top_depth"].shape == (120, 160, 1)
-        assert observation["top_depth"].dtype == np.uint16
-        assert observation["top"].shape == (120, 160, 3)
-        joints = {key: value for key, value in observation.items() if key in robot.action_features}
-        scene.ask(request="fault", fault=fault)
-        with pytest.raises(ArmStoppedError, match=r"'top' gives no pictures .*; the arm was stopped"):
-            turn(robot, joints, n_steps=300)
-        with pytest.raises(ArmStoppedError, match="the arm was stopped"):
-            robot.send_action(joints)
-        stood = scene.ask(request="state")["q"]
-        time.sleep(0.2)
-        np.testing.assert_allclose(scene.ask(request="state")["q"], stood, atol=1e-4)
-    scene.ask(request="fault", fault="none")
-    scene.close()
+    try:
+        with robot:
+            observation = robot.get_observation()
+            assert observation["top_depth"].shape == (120, 160, 1)
+            assert observation["top_depth"].dtype == np.uint16
+            assert observation["top"].shape == (120, 160, 3)
+            joints = {key: value for key, value in observation.items() if key in robot.action_features}
+            scene.ask(request="fault", fault=fault)
+            with pytest.raises(ArmStoppedError, match=r"'top' gives no pictures .*; the arm was stopped"):
+                turn(robot, joints, n_steps=300)
+            with pytest.raises(ArmStoppedError, match="the arm was stopped"):
+                robot.send_action(joints)
+            stood = scene.ask(request="state")["q"]
+            time.sleep(0.2)
+            np.testing.assert_allclose(scene.ask(request="state")["q"], stood, atol=1e-4)
+    finally:  # whatever has stopped the arm: the next test, or this one once more, has the same world
+        scene.ask(request="fault", fault="none")
+        scene.close()
 
 
 def test_a_live_camera_is_viewed(world, tmp_path, monkeypatch):
