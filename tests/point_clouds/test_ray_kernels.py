@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import lerobot_uca
 from lerobot_uca import point_clouds
-from lerobot_uca.point_clouds import intersections, ray_casting, single_rays
+from lerobot_uca.point_clouds import compiling, ray_casting, single_rays
 from lerobot_uca.point_clouds.geometry import Camera, ray_sphere_distances
 from lerobot_uca.point_clouds.intersections import at_triangle, triangle
 from lerobot_uca.point_clouds.ray_casting import RayCaster
@@ -203,16 +203,16 @@ def test_what_is_compiled_follows_every_module(tmp_path):
 
 
 def test_what_was_compiled_long_ago_is_forgotten(tmp_path, monkeypatch):
-    monkeypatch.setattr(intersections.NUMBA, "CACHE_DIR", str(tmp_path / "users"))
-    cache = intersections._cache()
+    monkeypatch.setattr(compiling.NUMBA, "CACHE_DIR", str(tmp_path / "users"))
+    cache = compiling._cache()
     assert cache.parent == tmp_path / "users"  # as Numba does, which makes it
     old, young, others = (cache.with_name(name) for name in ("rays_old", "rays_young", "others"))
     for folder in (cache, old, young, others):
         folder.mkdir(parents=True)
         os.utime(folder, (0, 0))
     os.utime(young)
-    assert intersections._cache() == cache
+    assert compiling._cache() == cache
     assert old.exists()  # one that is there is looked up, no more
     cache.rmdir()
-    intersections._cache()
+    compiling._cache()
     assert [each.exists() for each in (old, young, others)] == [False, True, True]

@@ -81,7 +81,7 @@ def _calibration(dataset: Any, name: str, shape: tuple[int, ...], episodes: Sequ
             f"('{EXTRINSICS}{name}'). Clouds need a fixed camera: choose episodes in which it stands still."
         )
     (fx, _, cx), (_, fy, cy), _ = K[0].tolist()
-    height, width = (size for size in shape if size != 1)  # (H, W), (H, W, 1) or (1, H, W)
+    height, width = shape[1:] if shape[0] == 1 else shape[:2]  # (1, H, W), (H, W) or (H, W, 1)
     values = {
         "camera": name,
         "intrinsics": {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy},

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_uca.point_clouds.compiling import compiled
 from lerobot_uca.point_clouds.geometry import Array
-from lerobot_uca.point_clouds.intersections import Vector, compiled
+from lerobot_uca.point_clouds.intersections import Vector
 from lerobot_uca.point_clouds.rays import NEAREST_DEPTH
 
 Window = tuple[int, int, int, int]

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_uca.point_clouds.compiling import compiled
 from lerobot_uca.point_clouds.covered_pixels import Geom, may_cover, outline_of, projected, window
 from lerobot_uca.point_clouds.geometry import Array
 from lerobot_uca.point_clouds.intersections import (
@@ -25,7 +26,6 @@ from lerobot_uca.point_clouds.intersections import (
     Vector,
     at_primitive,
     at_triangle,
-    compiled,
     triangle,
 )
 from lerobot_uca.point_clouds.rays import Hits, Rays
